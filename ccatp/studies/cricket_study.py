@@ -249,8 +249,7 @@ def _sized_cell(size: int, seed: int) -> dict[str, Any]:
     looked_s = time.perf_counter()
     found = map_motes(network, MapFitSettings(_ROBUST), mirrors=folds.mirrors)
     mapped_s = time.perf_counter()
-    in_doubt = {mote for _, motes in folds.mirrors for mote in motes}
-    in_doubt |= {mote for fold in found.folds for mote in fold.motes}
+    in_doubt = found.doubtful(folds.mirrors)
     sure = [mote for mote in range(network.count) if mote not in in_doubt]
     of_all, of_sure = (
         best_motion(places, true, mirrors=True).moved(places) - true

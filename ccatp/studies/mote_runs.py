@@ -21,7 +21,7 @@ from ccatp.beacons.cricket.range_network import (
 )
 from ccatp.beacons.cricket.rigidity import FoldOver, Freedom, find_fold_over, find_freedom, generic_state
 from ccatp.beacons.cricket.self_mapping import begin_phase_two, complete_stands, run_phase_two
-from ccatp.beacons.cricket.trilateration import FirstMap, map_as_possible, map_by_plan
+from ccatp.beacons.cricket.trilateration import FirstMap, map_by_plan
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import RigidMotion, aligned_rms_m, best_motion, rms_m
@@ -118,15 +118,21 @@ class MoteOutlook:
 
 
 def first_map(cfg: CricketConfig, field: SimulatedField, draws: int = 0) -> FirstMap:
-    """Phase 1, its bias and covariance by so many draws (raises MappingError: a step that cannot be made)."""
-    network = field.network()
-    if field.plan.bodies:
-        return map_by_plan(field.plan, network, cfg.phase1.max_dop, draws)
-    return map_as_possible(network, cfg.phase1.max_dop, draws)
+    """Phase 1: trilateration of stands, its bias and covariance by so many draws; the batch where there is no plan.
+
+    Raises MappingError: a step that cannot be made.
+    """
+    plan, network = field.plan, field.network()
+    if plan.bodies:
+        return map_by_plan(plan, network, cfg.phase1.max_dop, draws)
+    mirrors = find_fold_over(network, np.random.default_rng(_GENERIC)).mirrors
+    found = map_motes(network, _settings(cfg), **_calibration(cfg), mirrors=mirrors)
+    nowhere, doubtful = np.zeros_like(found.positions_m), found.doubtful(mirrors)
+    return FirstMap(found.positions_m, found.covariance_m2, nowhere, doubtful=doubtful)
 
 
 def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
-    """Phases 1 and 2: trilateration, then the filter over distances between the first motes of the stands.
+    """Phases 1 and 2: a first map, then the filter over distances between the first motes of the stands.
 
     MappingError: phase 1 cannot place a mote.
     """
@@ -155,6 +161,7 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
         offset_m=mapper.offset_m,
         scale=mapper.scale,
         nis=went.nis,
+        doubtful=tuple(motes.index(mote) for mote in first.doubtful),
         whole=whole,
     )
 
@@ -169,20 +176,19 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
     network = batch_network(cfg, field)
     first = None
     with suppress(MappingError):  # the batch needs no trilateration
-        first = first_map(cfg, field)
+        first = first_map(cfg, field) if plan.bodies else None
     start_m = None if first is None else first.positions_m
     mirrors = () if outlook is None else outlook.folds.mirrors
-    settings = MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
-    found = map_motes(network, settings, **_calibration(cfg), start_m=start_m, mirrors=mirrors)
+    found = map_motes(network, _settings(cfg), **_calibration(cfg), start_m=start_m, mirrors=mirrors)
     motes = list(plan.mapped)
     true_m = field.true_m[motes]
     phase1_m = None
-    if first is not None and not set(motes) & set(first.unplaced):
+    if first is not None:
         phase1_m = aligned_rms_m(first.positions_m[motes], true_m, mirrors=not plan.anchors)
     positions, covariance = _in_field(field, found, has_shapes=bool(network.bodies))
     positions, covariance = positions[motes], _block(covariance, motes, plan.dimension)
     error_m = aligned_rms_m(positions, true_m, mirrors=not plan.bodies)
-    lost = {mote for fold in found.folds for mote in fold.motes} | {mote for _, moved in mirrors for mote in moved}
+    lost = found.doubtful(mirrors)
     return MoteRun(
         names=tuple(plan.names[mote] for mote in motes),
         positions_m=positions,
@@ -197,6 +203,10 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
         scale=found.fit.state.scale,
         doubtful=tuple(row for row, mote in enumerate(motes) if mote in lost),
     )
+
+
+def _settings(cfg: CricketConfig) -> MapFitSettings:
+    return MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
 
 
 def _calibration(cfg: CricketConfig) -> Any:

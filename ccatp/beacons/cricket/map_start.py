@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import shortest_path
 
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.range_network import PairMeans, RangeNetwork, adjacency, every_pair
-from ccatp.beacons.cricket.trilateration import classical_scaling, sphere_crossings
+from ccatp.beacons.cricket.trilateration import sphere_crossings
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion
 
@@ -44,6 +44,17 @@ def unfolded(network: RangeNetwork, rng: np.random.Generator | None = None) -> F
         centred = points - points.mean(axis=0)
         points = np.asarray(centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1])  # along the principal axes
     return np.ascontiguousarray(points[:, :d])
+
+
+def classical_scaling(distances_m: FloatArray, dimension: int) -> FloatArray:
+    """Torgerson's scaling (1952): the leading eigenvectors of -1/2 J D^2 J, shape (n, dimension)."""
+    squares = distances_m**2
+    centred = squares - squares.mean(axis=0) - squares.mean(axis=1)[:, None] + squares.mean()
+    values, vectors = np.linalg.eigh(-0.5 * centred)
+    points = np.zeros((len(distances_m), dimension))
+    kept = min(dimension, len(distances_m))
+    points[:, :kept] = vectors[:, ::-1][:, :kept] * np.sqrt(np.maximum(values[::-1][:kept], 0.0))
+    return points
 
 
 def completed(network: RangeNetwork) -> FloatArray:

@@ -1,7 +1,6 @@
 """A map from measured ranges: filter or batch, doubts about it, its error where the truth is known, a report."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -31,7 +30,6 @@ from ccatp.beacons.cricket.range_network import (
 )
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
 from ccatp.beacons.cricket.self_mapping import MoteMapper, run_phase_two
-from ccatp.beacons.cricket.trilateration import map_as_possible
 from ccatp.beacons.slam.track_review import next_range
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
@@ -181,7 +179,10 @@ def map_measured(
     freedom = find_freedom(model, generic_state(model, rng))
     folds = find_fold_over(network, rng)
     _check_enough(model, network)
-    found = _batch(cfg, network, folds.mirrors) if method == "batch" else _filter(cfg, network)
+    if method == "ekf" and network.bodies:
+        raise MappingError("the filter maps no trolleys: leave --tags out, or take --method batch")
+    found = _batch(cfg, network, folds.mirrors)
+    found = _filter(cfg, network, found) if method == "ekf" else found
     motes = [row for row, name in enumerate(network.names) if name not in file.tags]
     names = tuple(network.names[mote] for mote in motes)
     true_m = None if truth_m is None else _truth(truth_m, names, network.dimension)
@@ -214,7 +215,7 @@ def map_measured(
         "crlb_m": None if is_thin else bound_m,
         "rank_deficiency": freedom.deficiency,
         "fold_over_risk": not folds.is_unique,
-        "phase1_rms_m": _phase1_error_m(cfg, network, motes, true_m),
+        "phase1_rms_m": None,
         "iterations": found.iterations,
         "method": method,
         "seeds": 1,
@@ -288,32 +289,19 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Mirrors) -> _Foun
     return _Found(found.fit.state, covariance, scaled, found.iterations, not is_denied, tuple(warnings))
 
 
-def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
-    if network.bodies:
-        raise MappingError("the filter maps no trolleys: leave --tags out, or take --method batch")
-    first = map_as_possible(network, cfg.phase1.max_dop, cfg.phase1.draws)
-    if first.unplaced:
-        lost = list_names([network.names[mote] for mote in first.unplaced])
-        raise MappingError(f"trilateration cannot place {lost}; take --method batch, which needs no such start")
+def _filter(cfg: CricketConfig, network: RangeNetwork, first: _Found) -> _Found:
+    places_m = first.state.positions_m
+    if _is_flat(map_rms_m(first.covariance_m2, places_m, range(network.count), aligned=True), places_m):
+        shape = "in a line" if network.dimension == 2 else "in a plane"
+        raise MappingError(f"the motes lie {shape}, or nearly: the filter has no beginning; take --method batch")
     # The ranges have made the first map already: its shape is a start, and its covariance, taken wide, hardly counts.
-    mapper = MoteMapper(first.positions_m, _WIDER * first.covariance_m2, cfg.phase2)
+    mapper = MoteMapper(places_m, _WIDER * first.covariance_m2, cfg.phase2)
     columns = (network.first, network.second, network.ranges_m, network.sigmas_m)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     went = run_phase_two(mapper, rows, 0.0)
-    warnings = (f"{went.refused} of {len(went.nis)} ranges were refused by the gate",) if went.refused else ()
-    return _Found(MapState(mapper.positions_m), mapper.covariance_m2, network, len(went.nis), True, warnings)
-
-
-def _phase1_error_m(
-    cfg: CricketConfig, network: RangeNetwork, motes: list[int], true_m: FloatArray | None
-) -> float | None:
-    if true_m is None:
-        return None
-    with suppress(MappingError):
-        first = map_as_possible(network, cfg.phase1.max_dop)
-        if not set(first.unplaced) & set(motes):
-            return aligned_rms_m(first.positions_m[motes], true_m, mirrors=True)
-    return None
+    refused = (f"{went.refused} of {len(went.nis)} ranges were refused by the gate",) if went.refused else ()
+    state, warnings = MapState(mapper.positions_m), (*first.warnings, *refused)
+    return _Found(state, mapper.covariance_m2, network, len(went.nis), first.is_trusted, warnings)
 
 
 def _truth(truth_m: Places, names: tuple[str, ...], dimension: int) -> FloatArray:

@@ -65,6 +65,11 @@ class MoteMap(NamedTuple):
         """Cost by degree of freedom: 1 where the sigmas are right."""
         return self.fit.cost / self.dof if self.dof > 0 else 1.0
 
+    def doubtful(self, mirrors: Mirrors) -> tuple[int, ...]:
+        """Motes that may be mirrored: by the graph, or because their image fits almost as well."""
+        found = {mote for fold in self.folds for mote in fold.motes}
+        return tuple(sorted(found | {mote for _, motes in mirrors for mote in motes}))
+
 
 def map_motes(
     network: RangeNetwork, settings: MapFitSettings, *, with_offset: bool = False, with_scale: bool = False,

@@ -219,10 +219,6 @@ class PairMeans:
         for i, j in (self.pairs.T, self.pairs.T[::-1]):
             self.table_m[i, j], self.sigma_table_m[i, j] = self.ranges_m, self.sigmas_m
 
-    def partners(self, mote: int) -> IndexArray:
-        """The motes that have a range to this one."""
-        return np.flatnonzero(np.isfinite(self.table_m[mote]))
-
 
 _MEDIAN_COST = np.sqrt(np.pi / 2.0)  # of the median's standard deviation against the mean's, for normal noise
 

@@ -174,12 +174,9 @@ def begin_phase_two(cfg: CricketConfig, plan: MotePlan, first: FirstMap) -> Mote
     """The filter over the first motes of the stands, or over all motes where there are none, after phase 1.
 
     The printed prior, the covariance of Patil et al. eq. 25, is one variance for all coordinates. It is no prior of a
-    map by trilateration: its errors are centimetres to decimetres and correlated. Raises MappingError: phase 1 has
-    left one of these motes without a place.
+    map by trilateration: its errors are centimetres to decimetres and correlated.
     """
     motes = list(plan.heads or plan.mapped)
-    if lost := [plan.names[mote] for mote in motes if mote in first.unplaced]:
-        raise MappingError(f"phase 1 cannot place {lost[0]} (and {len(lost) - 1} more); the batch needs no such start")
     at = coordinates_of(motes, plan.dimension)
     mean, covariance = (first.positions_m + first.bias_m)[motes], first.covariance_m2[np.ix_(at, at)]
     known = plan.surveyed_m[motes]

@@ -1,13 +1,12 @@
-"""Phase 1 of self-mapping: a first map by trilateration, by a plan or as the ranges allow, and its drawn errors."""
+"""Phase 1 of self-mapping: a first map by trilateration after a plan, and its drawn errors."""
 
 from collections.abc import Sequence
-from itertools import combinations, pairwise
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ccatp.beacons.cricket.map_fit import rigidity_matrix, robust_loss
+from ccatp.beacons.cricket.map_fit import robust_loss
 from ccatp.beacons.cricket.mote_plan import MotePlan
 from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, list_names
 from ccatp.core import FloatArray
@@ -57,17 +56,6 @@ def trilaterate(
     return points, costs
 
 
-def classical_scaling(distances_m: FloatArray, dimension: int) -> FloatArray:
-    """Torgerson's scaling (1952): the leading eigenvectors of -1/2 J D^2 J, shape (n, dimension)."""
-    squares = distances_m**2
-    centred = squares - squares.mean(axis=0) - squares.mean(axis=1)[:, None] + squares.mean()
-    values, vectors = np.linalg.eigh(-0.5 * centred)
-    points = np.zeros((len(distances_m), dimension))
-    kept = min(dimension, len(distances_m))
-    points[:, :kept] = vectors[:, ::-1][:, :kept] * np.sqrt(np.maximum(values[::-1][:kept], 0.0))
-    return points
-
-
 class DegenerateStep(MappingError):
     """A step of phase 1 whose geometry does not determine a mote well enough."""
 
@@ -78,7 +66,7 @@ class TrilaterationStep(NamedTuple):
     mote: int
     references: tuple[int, ...]
     dop: float
-    how: str  # ``axes``, ``cosines``, ``seed`` or ``trilateration``
+    how: str  # ``axes``, ``cosines`` or ``trilateration``
 
 
 class Sketch:
@@ -93,12 +81,6 @@ class Sketch:
         self.positions_m = np.full((network.count, network.dimension), np.nan)
         self._seen_m = self.positions_m.copy()  # places from which the dilution of precision is judged
         self.steps: list[TrilaterationStep] = []
-        self._first_covariance_m2 = np.zeros((0, 0))  # of the motes that begin the map
-
-    @property
-    def is_placed(self) -> NDArray[np.bool_]:
-        """Which motes have a place, shape (n,)."""
-        return np.asarray(np.isfinite(self.positions_m[:, 0]))
 
     def judge_from(self, motes: Sequence[int], places_m: FloatArray) -> None:
         """Judge later steps from better places than those found, shape (k, d).
@@ -110,15 +92,9 @@ class Sketch:
 
     def set_axes(self, origin: int, axis: int) -> None:
         """Origin and second axis: A (0, 0), B (0, d_AB); in the plane alone. Raises MappingError: A and B have none."""
-        range_m, sigma_m = (values[0] for values in self._ranges(axis, [origin]))
-        places_m = np.array([[0.0, 0.0], [0.0, range_m]])
-        self.add_together([origin, axis], places_m, np.diag((0.0, 0.0, 0.0, sigma_m**2)), "axes")
-
-    def add_together(self, motes: Sequence[int], places_m: FloatArray, covariance_m2: FloatArray, how: str) -> None:
-        """Motes that begin a map together, with their covariance, shapes (k, d) and (k d, k d)."""
-        self.positions_m[list(motes)] = self._seen_m[list(motes)] = places_m
-        self._first_covariance_m2 = covariance_m2
-        self.steps += [TrilaterationStep(mote, (), 0.0, how) for mote in motes]
+        motes, places_m = [origin, axis], np.array([[0.0, 0.0], [0.0, self._ranges(axis, [origin])[0][0]]])
+        self.positions_m[motes] = self._seen_m[motes] = places_m
+        self.steps += [TrilaterationStep(mote, (), 0.0, "axes") for mote in motes]
 
     def add_by_cosines(self, mote: int, origin: int, axis: int) -> None:
         """A mote on the right of the axis from A to B, by the law of cosines.
@@ -185,7 +161,7 @@ class Sketch:
         the ``maps`` that were drawn (iterated bootstrap: Hall 1986; 0: at the places alone). These are turned one way
         and the other, so across the arcs the covariance is wider than that of the errors there are (NEES 0.8); phase 2
         is less sure than the errors at the places alone would make it (docs/cricket.md). ``places_m``: where the motes
-        might be, nan for those without a place, shape (n, d). Zeros without draws.
+        might be, shape (n, d). Zeros without draws.
         """
         count, d = places_m.shape
         if draws == 0:
@@ -193,7 +169,7 @@ class Sketch:
         rng = np.random.default_rng(0)  # the same draws for every map: the same ranges give the same one
         near = self._drawn(places_m, maps, rng) if maps else places_m[None]
         errors = np.concatenate([self._drawn(places, draws // len(near), rng) - places for places in near])
-        errors = np.nan_to_num(errors).reshape(len(errors), -1)
+        errors = errors.reshape(len(errors), -1)
         return errors.mean(axis=0).reshape(count, d), np.atleast_2d(np.cov(errors.T))
 
     def _drawn(self, places_m: FloatArray, draws: int, rng: np.random.Generator) -> FloatArray:
@@ -206,13 +182,8 @@ class Sketch:
         lengths[first, second] = true_m[:, None] + self.means.sigmas_m[:, None] * errors_of
         lengths[second, first] = lengths[first, second]
         drawn = np.broadcast_to(places_m, (draws, count, d)).copy()
-        first_of_all = [step.mote for step in self.steps if not step.references]
-        if self.steps[0].how == "axes":
-            drawn[:, first_of_all[1], 1] = lengths[first_of_all[0], first_of_all[1]]
-        else:
-            size = len(self._first_covariance_m2)
-            errors = rng.multivariate_normal(np.zeros(size), self._first_covariance_m2, draws, method="eigh")
-            drawn[:, first_of_all] += errors.reshape(draws, -1, d)
+        origin, axis = (step.mote for step in self.steps if step.how == "axes")
+        drawn[:, axis, 1] = lengths[origin, axis]
         for step in self.steps:
             references, own = list(step.references), lengths[list(step.references), step.mote].T
             if step.how == "cosines":
@@ -251,11 +222,11 @@ def sphere_crossings(anchors_m: FloatArray, ranges_m: FloatArray) -> FloatArray:
 class FirstMap(NamedTuple):
     """What phase 1 gives."""
 
-    positions_m: FloatArray  # nan for motes without a place, shape (n, d)
-    covariance_m2: FloatArray  # of all coordinates, zero for motes without a place or without draws, shape (n d, n d)
+    positions_m: FloatArray  # shape (n, d)
+    covariance_m2: FloatArray  # of all coordinates, zero without draws, shape (n d, n d)
     bias_m: FloatArray  # mean error of the places, as far as it is known, shape (n, d)
-    steps: tuple[TrilaterationStep, ...]
-    unplaced: tuple[int, ...]
+    steps: tuple[TrilaterationStep, ...] = ()
+    doubtful: tuple[int, ...] = ()  # motes whose mirror image fits almost as well
 
 
 def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: int = 0, maps: int = _NEAR) -> FirstMap:
@@ -281,74 +252,4 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
     up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
     motion = RigidMotion(np.column_stack([(up[1], -up[0]), up]), plan.axes_m[0])
     positions, covariance = motion.moved(sketch.positions_m), motion.turned_map(covariance)
-    return FirstMap(positions, covariance, bias @ motion.rotation.T, tuple(sketch.steps), ())
-
-
-def map_as_possible(network: RangeNetwork, max_dop: float, draws: int = 0) -> FirstMap:
-    """A trilateration without a plan: a good triangle (tetrahedron) of motes begins, whoever has most ranges follows.
-
-    Motes that cannot be placed well enough, from d + 1 others at least, are left out. Raises DegenerateStep: there is
-    no triangle (tetrahedron) to begin with.
-    """
-    sketch = Sketch(network, max_dop)
-    _begin(network, sketch)
-    has_range = np.isfinite(sketch.means.table_m)
-    refused: set[int] = set()
-    while True:
-        is_placed = sketch.is_placed
-        reach = np.where(is_placed, 0, (has_range & is_placed).sum(axis=1))
-        reach[list(refused)] = 0
-        mote = int(np.argmax(reach))
-        if reach[mote] <= network.dimension:
-            break
-        try:
-            sketch.add_by_ranges(mote, np.flatnonzero(has_range[mote] & is_placed).tolist())
-            refused.clear()  # what was refused for want of references may have one more now
-        except DegenerateStep:
-            refused.add(mote)
-    bias, covariance = sketch.draw_errors(sketch.positions_m, draws)
-    unplaced = tuple(np.flatnonzero(~sketch.is_placed).tolist())
-    return FirstMap(sketch.positions_m, covariance, bias, tuple(sketch.steps), unplaced)
-
-
-_FLAT = 4.0  # of range errors that may make a flat beginning look high
-_CLIQUES = 4000  # first motes looked at; the best of them begins the map
-
-
-def _begin(network: RangeNetwork, sketch: Sketch) -> None:
-    """Place the simplex of greatest height, its least extent along a principal axis."""
-    d, means = network.dimension, sketch.means
-    best, best_height_m, seen = tuple[int, ...](), 0.0, 0
-    for i, j in means.pairs.tolist():
-        common = np.intersect1d(means.partners(i), means.partners(j)).tolist()
-        for rest in combinations([mote for mote in common if mote > j], d - 1):
-            lengths = _lengths(means.table_m, (i, j, *rest))
-            if np.isnan(lengths).any():
-                continue
-            seen += 1
-            height_m = float(np.linalg.svd(classical_scaling(lengths, d), compute_uv=False)[-1])
-            if height_m > best_height_m:
-                best, best_height_m = (i, j, *rest), height_m
-        if seen > _CLIQUES:
-            break
-    if not best:
-        shape = "triangle" if d == 2 else "tetrahedron"
-        raise DegenerateStep(f"no {shape} of motes with ranges between all of them: trilateration has no beginning")
-    lengths, sigmas = _lengths(means.table_m, best), _lengths(means.sigma_table_m, best)
-    # A simplex that is flat looks as high as this by the errors of its ranges alone.
-    if best_height_m**2 < _FLAT * float(lengths.max()) * float(sigmas.max()):
-        raise DegenerateStep(
-            f"{', '.join(network.names[mote] for mote in best)}: the best motes to begin with lie "
-            f"{'in a line' if d == 2 else 'in a plane'}, or nearly: trilateration has no beginning"
-        )
-    places = classical_scaling(lengths, d)
-    a, b = np.triu_indices(d + 1, 1)
-    J = rigidity_matrix(places, a, b).toarray() / sigmas[a, b][:, None]
-    # Six (three) ranges determine as many distances: the pseudoinverse leaves out the frame alone.
-    sketch.add_together(best, places, np.asarray(np.linalg.pinv(J.T @ J, rcond=1e-9), dtype=np.float64), "seed")
-
-
-def _lengths(table: FloatArray, motes: Sequence[int]) -> FloatArray:
-    lengths = table[np.ix_(motes, motes)]
-    np.fill_diagonal(lengths, 0.0)
-    return lengths
+    return FirstMap(positions, covariance, bias @ motion.rotation.T, tuple(sketch.steps))
