@@ -82,58 +82,6 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
     assert importlib.metadata.version("click")  # the only package that help and version need
 
 
-# What takes a name; none that no file may have.
-NAMING = (["report"], ["replay"], ["map"], ["run", "--sim", "--mirror"], ["run", "--sim", "--world"])
-
-
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        (["rnu"], "ccatp: No such command 'rnu'. Did you mean 'run'?; see ccatp --help\n"),
-        (["sim", "robto"], "ccatp: No such command 'robto'. Did you mean 'robot'?; see ccatp sim --help\n"),
-        (["sim", "zzz"], "ccatp: No such command 'zzz'; see ccatp sim --help\n"),
-        (["run"], "ccatp: name the robot's configuration with --config FILE, or add --sim; see ccatp run --help\n"),
-        (["run", "--sim", "--resume"], "--resume: 0 unfinished runs in ./runs; name one with --run-dir"),
-        (["sim", "etalon", "--puck", "1", "2", "3", "--truth", "ipc://x"], "--puck and --truth exclude each other"),
-        (["sim", "etalon", "--puck", "nan", "0", "0"], "each of X Y Z is a number of metres, at most 1000 from the"),
-        (["sim", "etalon", "--puck", "0", "0", "-inf"], "each of X Y Z is a number of metres"),
-        (["sim", "etalon", "--truth", "foo"], "'foo' is no endpoint; give ipc://PATH, as ccatp sim robot prints it"),
-        (["sim", "etalon", "--truth", "tcp://a"], "'tcp://a' is no endpoint"),
-        (["sim", "etalon", "--truth", "ipc://x", "--runtime-dir", "x"], "leave out --puck and --truth"),
-        (["run", "--sim", "--miror", "x"], "Did you mean one of: '--mirror'"),
-        (["run", "--sim", "--set", "seed"], "'seed' is not KEY=VALUE, as in run.seed=2"),
-        (["run", "--sim", "--set", ".".join("a" * 99) + "=1"], "is not KEY=VALUE"),
-        (["run", "--sim", "--start-held"], "--start-held needs --resume; --resume-last always starts held"),
-        (["run", "--sim", "--resume-last", "--resume"], "--resume-last finds the run itself: leave out --resume"),
-        (["run", "--sim", "-q", "-v"], "--quiet and --verbose contradict each other"),
-        (["run", "--sim", "--held"], "--held is now called --start-held"),
-        (["run", "--sim", "--recover"], "--recover is now called --resume-last"),
-        (["log", "info", "x"], "the command 'log' is now called 'recording'"),
-        (["recording", "recover", "x"], "the command 'recover' is now called 'repair'"),
-        (["map", "x"], "the command 'map' is now called 'plot'"),
-        (["run", "--sim", "--seed", "one"], "'one' is not a valid integer"),
-        (["run", "--config", "a.toml", "--faults", "plan.toml"], "--faults needs --sim: faults are for the simulated"),
-        (["run", "--sim", "--faults", "none.toml"], "ccatp: none.toml: no such file or directory; name a TOML file"),
-        (["sim", "robot", "--faults", "none.toml"], "ccatp: none.toml: no such file or directory; name a TOML file"),
-        (["emergency", "fier"], "'fier' is not one of 'fire', 'earthquake', 'power', 'weather', 'operator'"),
-        (
-            ["config", "check", "none.toml"],
-            "ccatp: none.toml: no such file or directory; name a TOML file that exists\n",
-        ),
-        (["config", "check", "zigbe"], "zigbe: no such file, and no configuration by that name; did you mean zigbee?"),
-        (["run", "--config", "tonight", "--sim"], "'--config': tonight: no such file, and no configuration by that"),
-        (["conformance", "7010"], "'7010' is not HOST:PORT, as in 127.0.0.1:7010"),
-        (["conformance", "host:70100"], "'host:70100' is not HOST:PORT"),
-        (["conformance", "127.0.0.1:7010", "--only", "ttl-drve"], "no check 'ttl-drve'; did you mean ttl-drive?"),
-        (["conformance", "127.0.0.1:7010", "--only", "zzz"], "no check 'zzz'; available: "),
-        (["completion", "bahs"], "'bahs' is not one of 'bash', 'zsh', 'fish'"),
-        *(([*command, 300 * "x"], "ccatp: ") for command in NAMING),
-    ],
-)
-def test_misuse_is_one_line_and_exit_2(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert message in refused(capsys, *argv)
-
-
 def test_a_shipped_configuration_is_taken_by_its_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -142,20 +90,6 @@ def test_a_shipped_configuration_is_taken_by_its_name(
     assert printed(capsys, "config", "check", "zigbee").endswith("zigbee.toml: ok: system zigbee, seed 1\n")
     (tmp_path / "cricket").write_text("[run]\nseed = 7\n")  # a file of the user comes first
     assert printed(capsys, "config", "check", "cricket").startswith("cricket: ok: mirror fyst-m1")
-
-
-@pytest.mark.parametrize(
-    ("command", "time_s"),
-    [
-        *((["status"], time_s) for time_s in ("0", "-1", "nan", "inf", "1e300", "soon")),
-        *((command, "0") for command in (["pause"], ["emergency", "fire"], ["conformance", "127.0.0.1:7010"])),
-    ],
-)
-def test_a_time_to_wait_is_finite_and_more_than_none(
-    command: list[str], time_s: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told = f"'--timeout': {time_s} is no time to wait; give more than 0 s"
-    assert told in refused(capsys, *command, "--timeout", time_s)
 
 
 def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,7 +21,7 @@ from ccatp.daemon.terminal import clock, status_line, status_rows
 from ccatp.links.topics import MissionStatus
 from ccatp.survey.composition import assemble
 from ccatp.survey.planning.search import leg_lengths
-from tests.support.command import answered, printed, refused
+from tests.support.command import answered, printed
 from tests.unit.test_keys import serving
 
 BASH = shutil.which("bash")
@@ -144,32 +144,6 @@ def test_the_text_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.splitlines()[1].endswith(" ...")
     said = printed(capsys, "plan", "--mirror", "fyst-m2", "--panels", "1")
     assert "fyst-m2: 9 points of 1 panel, order thesis\n" in said
-
-
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (["--mirror", "fyst-m3"], "fyst-m3"),
-        (["--panels", "-1"], "run.panels"),
-        (["--panels", "999"], "run.panels = 999, but fyst-m1 has 77 panels; 0 takes all of them"),
-        (["--set", "limits.v_max_m_s=1e-300"], "limits.v_max_m_s = 1e-300 must be greater than or equal to 0.001"),
-        (
-            ["--set", "mirror.surface.normalisation_radius_mm=1e-300"],
-            "normalisation_radius_mm = 1e-300 must be greater than or equal to",
-        ),
-        (["--figure", "nowhere/plan.png"], "--figure: no directory nowhere; make it first"),
-        (
-            ["--panels", "1", "--figure", "plan.tiff7"],
-            "--figure: plan.tiff7: no format by that name; the file may end in",
-        ),
-    ],
-)
-def test_what_cannot_be_is_refused_in_one_line(
-    args: list[str], message: str, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-    assert message in refused(capsys, "plan", *args)
 
 
 NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")

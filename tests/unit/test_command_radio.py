@@ -1,7 +1,6 @@
 """The commands ``ccatp radio slam``, ``calibrate``, ``fix``, ``fuzzy``; survey commands given a run among beacons."""
 
 import json
-import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +12,9 @@ import pytest
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.cli import main
 from ccatp.config.load import load_recordings_config
-from ccatp.config.package import configs_dir
 from ccatp.filters.base import FilterDiverged
-from ccatp.links.topics import schema_of
-from ccatp.records.recorder import Recorder
 from ccatp.studies.gtsam_peer import PeerError, PeerGaveUp, run_gtsam
-from tests.support.command import answered, printed, refused
+from tests.support.command import answered, printed
 from tests.unit.beacons.datasets.sets import (
     BEACONS,
     csv_lines,
@@ -110,27 +106,6 @@ def test_the_table_names_what_was_found(tmp_path: Path, capsys: pytest.CaptureFi
     assert advice[0].startswith("measure next: beacon ")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "what"),
-    [
-        (["missing"], "missing: no such file or folder"),
-        (["{csv}", "--robot", "1"], "a csv set has one vehicle: leave out --robot"),
-        (["{csv}", "--format", "labyrinth"], "mine.csv:2: 'event,time_s,...' is none of range2"),
-        (["{csv}", "--format", "lidar"], "'lidar' is not one of"),
-        (["{csv}", "--filter", "particle"], "'particle' is not one of"),
-        (["{csv}", "--figure", "{tmp}/no/map.png"], "--figure: no directory"),
-        (["{csv}", "--figure", "{tmp}/map.wrong"], "map.wrong: no format by that name"),
-        (["{csv}", "--set", "csv.radio.range_sigma_m=-1"], "csv.radio.range_sigma_m"),
-        (["{csv}", "--set", "csv.radio.nothing=1"], "csv.radio.nothing"),
-    ],
-)
-def test_a_fault_is_one_line_and_status_2(
-    recording: Path, tmp_path: Path, arguments: list[str], what: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    filled = [argument.format(csv=recording, tmp=tmp_path) for argument in arguments]
-    assert what in refused(capsys, "radio", "slam", *filled)
-
-
 @pytest.mark.parametrize("error", [FilterDiverged("prediction is not finite"), np.linalg.LinAlgError("singular")])
 def test_an_estimator_that_finds_nothing(
     recording: Path, error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -171,39 +146,6 @@ def test_fuzzy_tells_the_speed_at_a_point(tmp_path: Path, capsys: pytest.Capture
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
 
 
-SURVEY = Path(__file__).parents[2] / "configs" / "ccatp.toml"
-GAP = 'control.fuzzy.rules=[{when={distance_m="near"},then="slow"}]'
-NO_POINT = "wants a distance >= 0 m and a finite angle"
-
-
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        (("calibrate", "nowhere.csv"), "no such file"),
-        (("calibrate", "{tmp}/rnd.csv"), "is not text; give a CSV file or an .xlsx workbook with columns of levels"),
-        (("calibrate", "{tmp}/flat.csv"), "flat.csv: levels do not fall with distance"),
-        (("fix", "nowhere.csv"), "give the place of two beacons"),
-        (("fix", "nowhere.csv", "--beacon", "A"), "is not NAME=X,Y"),
-        (("fix", "nowhere.csv", *CORNERS), "no such file"),
-        (("fix", "nowhere.csv", "--beacon", "A=0,0", "--beacon", "B=0,0"), "which bounds no room"),
-        (("fix", "{tmp}/places.csv", *CORNERS, "--path-loss", "{tmp}/flat.csv"), "flat.csv: levels do not fall"),
-        (("fuzzy", "--set", GAP), "no rule of the fuzzy controller fires"),
-        (("fuzzy", "--figure", "{tmp}/none/b.png"), "--figure: no directory"),
-        *((("fuzzy", "--at", *at), NO_POINT) for at in (("nan", "0.5"), ("-3", "0.5"), ("1", "inf"), ("inf", "0"))),
-        (("slam", "{tmp}"), "name it with --format"),
-        (("slam", "{tmp}", "--format", "labyrinth"), "holds no Labyrinth text"),
-        (("map", "--config", str(SURVEY)), "ccatp.toml: is the configuration of a survey of a mirror"),
-    ],
-)
-def test_bad_input_is_one_line(
-    argv: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "rnd.csv").write_bytes(b"\xff\xfe\x00\x81")
-    (tmp_path / "flat.csv").write_text("distance_m,rssi_dbm\n1,-60\n2,-50\n3,-40\n")
-    places(tmp_path)
-    assert message in refused(capsys, "radio", *(part.replace("{tmp}", str(tmp_path)) for part in argv))
-
-
 def places(folder: Path) -> Path:
     rows = []
     for x in (0.5, 1.5, 2.5, 3.5):
@@ -212,28 +154,6 @@ def places(folder: Path) -> Path:
             rows.append(f"{x},{y}," + ",".join(f"{-45.0 - 25.0 * np.log10(d) + 0.1 * ((x + y) % 2):.3f}" for d in r))
     (folder / "places.csv").write_text("x,y,RSSI A,RSSI B,RSSI C\n" + "\n".join(rows) + "\n")
     return folder / "places.csv"
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ((), "give either --fingerprints or --path-loss"),
-        (("--room", "1,2"), "is not X0,Y0,X1,Y1"),
-        (("--room", "1,2,0,3"), "its second corner"),
-        (("--room", "0,0,1,inf"), "must be numbers within"),
-        (("--spacing", "0"), "must be above 0 and at most the room's longer side 6 m"),
-        (("--spacing", "nan"), "must be above 0"),
-        (("--spacing", "1e-4"), "more than 250000 points in a room of 6 by 6 m; give 0.012 m or more"),
-        (("--beacon", "A=1,1"), "A was given before"),
-        (("--beacon", "D=nan,0"), "--beacon D=nan,0: coordinates must be numbers"),
-        (("--beacon", "=1,0"), "--beacon =1,0: has no name"),
-        (("--exchange", "A,Z"), "is not two beacons of the data, which has A, B, C"),
-    ],
-)
-def test_fix_says_what_is_missing(
-    tmp_path: Path, more: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert message in refused(capsys, "radio", "fix", places(tmp_path), *CORNERS, *more)
 
 
 def test_fix_finds_places_and_exchanged_beacons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -272,34 +192,6 @@ def test_xbee_sheets_and_logs_agree(capsys: pytest.CaptureFixture[str]) -> None:
     assert other["readings"] == 900
     assert other["exponent"] == pytest.approx(one["exponent"], abs=0.05)
     assert other["shadowing_sigma_db"] > 5.0 * other["white_sigma_db"]
-
-
-OF_BEACONS = '{run}/config.toml: is of a mission among beacons (system = "zigbee")'
-
-
-@pytest.mark.parametrize(
-    ("command", "said_of_it"),
-    [
-        (["align"], OF_BEACONS),
-        (["plot"], "{run}: a mission among beacons; this is for surveys, ccatp report takes both"),
-        (["replay"], OF_BEACONS),
-        (["calibrate", "--from"], OF_BEACONS),
-    ],
-)
-def test_a_run_among_beacons_is_named_as_such(
-    command: list[str], said_of_it: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copy(configs_dir() / "zigbee.toml", tmp_path / "config.toml")
-    Recorder(tmp_path / "telemetry.mcap", [("truth", schema_of("truth"))], is_simulation=True).close()
-    err = refused(capsys, *command, tmp_path)
-    assert said_of_it.format(run=tmp_path) in err
-    assert "ccatp report" in err
-
-
-def test_the_check_is_of_surveys(capsys: pytest.CaptureFixture[str]) -> None:
-    err = refused(capsys, "check", "--sim", "--config", configs_dir() / "zigbee.toml")
-    assert "is of a mission among beacons" in err
-    assert "surveys of mirrors alone; use ccatp run" in err
 
 
 # -- GTSAM on the same input: it solves what it can, and says so where it cannot --------------------------------------

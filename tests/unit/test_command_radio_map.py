@@ -147,20 +147,6 @@ def test_eight_surveyed_anchors(with_tags: bool, tmp_path: Path, capsys: pytest.
     assert offset["offset_m"] == pytest.approx(0.12, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    ("rows", "what"),
-    [
-        ("A,B,-1.0", ":2: range of -1 m is no distance"),
-        ("A,B,1.0\nC,D,1.0", "the motes fall into 2 parts"),
-        ("A,B,1.0\nB,C,1.0\nC,D,1.0", "3 pairs of 4 motes were measured, a map in 2"),
-    ],
-)
-def test_ranges_that_make_no_map(rows: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "ranges.csv"
-    path.write_text(f"first,second,range_m\n{rows}\n")
-    assert what in refusal(capsys, "--ranges", str(path))
-
-
 def measured(path: Path, rows: str, capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:
     path.write_text("first,second,range_m\n" + rows)
     return mapped(capsys, "--ranges", str(path), *args)
@@ -193,47 +179,7 @@ def test_ranges_of_one_pair_that_disagree(tmp_path: Path, capsys: pytest.Capture
     assert not any("disagree" in warning for warning in sound["warnings"])
 
 
-SESSION_ROWS = "session,pos,deg,anchor,tag,mean_m\n" + "".join(
-    f"s,1,0,{a},{t},{3 + a + t}\n" for a in range(4) for t in range(3)
-)
 IN_SPACE = "--set cricket.dimension=3 --set cricket.layout=random --set cricket.random.size_m=[1,1,1]"
-APART = "--set cricket.layout=random --set cricket.random.count=30 --set cricket.random.reach_m=9"
-
-
-@pytest.mark.parametrize(
-    ("args", "places", "what"),
-    [
-        ("--ranges {ranges} --truth {places}", "M0,0,0", "--truth: no place of M1, M2, M3, M4, M5; there are M0"),
-        (f"--ranges {{ranges}} --truth {{truth}} {IN_SPACE}", "M0,0,0", "--truth: M0 has 2 coordinates, wanted 3"),
-        ("--ranges {ranges} --tags {places}", "M0,0,0", "--tags: these ranges are of no trolley"),
-        ("--ranges {session} --tags {places}", "tag0,0,0", "--tags: no place of tag1; there are tag0"),
-        (
-            "--ranges {session} --tags {places} --method ekf", "tag0,0,0\ntag1,0.2,0\ntag2,0,0.2",
-            "the filter maps no trolleys",
-        ),
-        ("--ranges {ranges} --figure m.gifx", "", "m.gifx: no format by that name"),
-        ("--ranges none.csv", "", "none.csv: no such file"),
-        ("--ranges r.csv --seeds 2", "", "--seeds is for simulated ranges"),
-        ("--tags t.csv", "", "--tags and --truth go with --ranges"),
-        ("--out {tmp}/no/b.toml", "", "--out: no directory"),
-        ("--dimension 3", "", 'cricket.dimension = 3 needs layout = "motes" or "random"'),
-        (
-            "--method ekf --set cricket.transducer.reach_m=[1,1,1,1,1]", "",
-            "no pair of phase 2 receives each other",
-        ),
-        ("--method ekf --set cricket.phase1.max_dop=5", "", "N2-1 from N1-1, N1-2, N1-3: dilution of precision"),
-        (APART, "", "the motes fall into"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_mapped_is_refused(
-    args: str, places: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    files = {name: tmp_path / f"{name}.csv" for name in ("ranges", "truth", "places", "session")}
-    ranges_file(files["ranges"], ALL)
-    truth_file(files["truth"])
-    files["places"].write_text(f"name,x_m,y_m\n{places}\n")
-    files["session"].write_text(SESSION_ROWS)
-    assert what in refusal(capsys, *args.format(**files, tmp=tmp_path).split())
 
 
 NOISE_M = 0.005

@@ -38,7 +38,6 @@ from ccatp.report.foxglove import (
     repeat_latched,
     view_schemas,
 )
-from tests.support.command import refused
 from tests.support.scenario import mirror_of
 
 MIRROR = mirror_of()
@@ -412,11 +411,6 @@ def test_a_network_is_served_only_when_told_to() -> None:
     for host in ("0.0.0.0", "192.0.2.1", "telescope"):
         with pytest.raises(StreamError, match="any host there could watch; permit it with --open-to-network"):
             check_host(host, is_open=False)
-
-
-def test_misuse(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "nothing to serve" in refused(capsys, "stream", "--no-plotjuggler")
-    assert "--open-to-network" in refused(capsys, "stream", "--host", "0.0.0.0")
 
 
 def test_a_host_that_is_no_name_ends_the_command(tmp_path: Path) -> None:
