@@ -162,10 +162,11 @@ def spend(night: Night) -> None:
 
 HEAD = """# A night with six faults
 
-A survey of three panels on the wall clock, simulated: the laser system was silent for a minute, the link to the robot
-broke for 6 s, an edge sensor saw nothing for 3 s, the database could not be written, the observatory reported the
-weather, the battery got low. This is what the alarms, their history and the posts of the webhook say of it the next
-morning. `python -m tests.processes.night FOLDER` spends such a night and writes this page; `make test-slow` checks one.
+This simulated survey of three panels runs in real time with six faults: the laser system is silent for a minute, the
+link to the robot breaks for 6 s, an edge sensor reports no panel for 3 s, the database cannot be written, the
+observatory reports bad weather, and the battery becomes low. The page shows the alarms, their history and the posts of
+the webhook.
+`python -m tests.processes.night FOLDER` runs this survey and writes the page; `make test-slow` repeats it as a test.
 """
 
 
