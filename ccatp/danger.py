@@ -1,19 +1,19 @@
 """The danger loop's rules and their arbitration: from one sensors frame to one verdict (thesis 3.4).
 
-Permits are the conjunction of all rules. The code is that of the most urgent: an edge (1) outranks an abort (2), which
-outranks normal operation (0). The cause is that of the rule that takes the most away.
+A motion is permitted if all rules permit it. The code is the most urgent one: an edge (1) precedes an abort (2), which
+precedes normal operation (0). The cause is that of the most restrictive rule.
 
-* all four edge sensors off: code 1, nothing permitted (``ccatp.safety.edge_rule``, rule h);
-* an edge declared: code 1, no motion towards a sensor that hangs over, no turn but back;
-* the robot's centre about to drive over the rim on the map: likewise (``ccatp.safety.edge_rule``);
-* edge samples, encoder samples or the estimate missing or older than allowed: nothing permitted, no code of its own;
-  ends by itself as soon as they are fresh again;
-* an emergency: code 2, latched, motion permitted, because the robot shall drive home
-  (``ccatp.safety.emergency_latch``); in an earthquake nothing is permitted until it is cleared.
+* All four edge sensors off: code 1, no motion permitted (``ccatp.safety.edge_rule``, rule h).
+* An edge declared: code 1, no motion towards a sensor that hangs over the edge, no turn except back.
+* The robot's centre about to cross the rim of the map: likewise (``ccatp.safety.edge_rule``).
+* Edge samples, encoder samples or the estimate missing or too old: no motion permitted, the code stays. This ends by
+  itself as soon as they are fresh again.
+* An emergency: code 2, latched, motion permitted because the robot shall drive home
+  (``ccatp.safety.emergency_latch``). In an earthquake no motion is permitted until it is cleared.
 
-The monitors of ``ccatp.safety.monitor`` check every frame. Each finding has a severity; the gravest wins and gives the
-verdict its cause, and any finding that holds the wheels withholds the permit. An edge that is to be left keeps its code
-and its cause as long as nothing holds the wheels.
+The monitors of ``ccatp.safety.monitor`` check every frame. The finding of the highest severity gives the verdict its
+cause, and any finding that holds the wheels denies all motion. A declared edge keeps its code, and its cause as long as
+nothing holds the wheels.
 """
 
 from collections.abc import Sequence
@@ -38,11 +38,11 @@ from ccatp.safety.monitor import HealthMonitor
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1
 EVERYWHERE = (True, True, True, True)
-_NORMAL = EventCode.NORMAL  # a member looked up on its class in every frame costs more than the verdict made of it
+_NORMAL = EventCode.NORMAL  # looking up a member of the enum in every frame costs more than making the verdict
 
 
 class DangerMonitor(EmergencyRules):
-    """Judges sensors frames. Without ``health`` there are only the rules of edges, ages and emergencies."""
+    """Gives one verdict per sensors frame. Without ``health`` only edges, ages and emergencies are checked."""
 
     def __init__(
         self, mirror: Mirror, robot: RobotConfig, cfg: DangerConfig, health: HealthConfig | None = None
@@ -56,7 +56,7 @@ class DangerMonitor(EmergencyRules):
         super().__init__()
 
     def reset(self) -> None:
-        """Begin a new session with the robot (its clock and numbers start again). Emergencies stay latched."""
+        """Begin a new session with the robot: its clock and numbers restart. Emergencies stay latched."""
         super().reset()
         self._edges.reset()
         self._origin = CentreClearanceCheck(self._rim, self._robot, self._cfg)
@@ -79,14 +79,14 @@ class DangerMonitor(EmergencyRules):
 
     @property
     def counts(self) -> dict[str, dict[Corner, int]]:
-        """How often each sensor left the panels, and declared an edge."""
+        """Number of episodes and of declared edges, by sensor."""
         counted = {"episodes": self._edges.opened, "edges": self._edges.declared}
         return {name: dict(zip(CORNERS, numbers, strict=True)) for name, numbers in counted.items()}
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def step(self, sensors: Sensors, estimate: EstimateMessage | None) -> Verdict:
-        """The verdict on a frame, with main's newest estimate; a frame that is not new gets the last verdict again."""
+        """The verdict on a frame, with main's newest estimate. A frame that is not new gets the last verdict."""
         seq = sensors.seq
         wheels: Sequence[WheelSample] = sensors.enc
         samples = sensors.edge
@@ -151,7 +151,7 @@ class DangerMonitor(EmergencyRules):
         return self._map.place(pose, self._robot.edge_sensors_m[sensor])
 
     def _is_explained(self, sensor: int) -> bool:
-        """Whether the map has an edge of a panel near a sensor, by the estimate."""
+        """Whether the map has an edge of a panel near a sensor, at the newest estimate; true without an estimate."""
         known, cfg = self._known, self._cfg
         if known is None:
             return True
@@ -171,7 +171,7 @@ class DangerMonitor(EmergencyRules):
         return found
 
     def _stays_off(self, sensor: int, episode: EdgeDetector, limit_m: float) -> bool:
-        """Once that is so, it stays so until the sensor has been on for long enough to end the episode."""
+        """Whether a sensor stays off although the robot has left the edge. Remains true until the episode ends."""
         if episode.phase is not EdgePhase.DECLARED:
             return False
         if not episode.is_doubted and episode.retreat_m >= limit_m:
@@ -200,12 +200,12 @@ class DangerMonitor(EmergencyRules):
     # -- what is missing ------------------------------------------------------------------------------------------
 
     def stale(self, seq: int, t_s: float) -> Verdict:
-        """The verdict when no sensors frame came for ``stale_after_s`` after frame ``seq``: nothing permitted."""
+        """The verdict when no frame arrived for ``stale_after_s`` after frame ``seq``: no motion is permitted."""
         limit_s = self._cfg.stale_after_s
         return self._denied(seq, t_s, conditions.NO_FRAME.found("sensors", limit_s, limit_s))
 
     def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
-        """A line after frame ``seq`` was no frame. The verdict where there were too many: nothing permitted."""
+        """Count a line after frame ``seq`` that is not a frame. Too many give a verdict that permits no motion."""
         found = None if self._board is None else self._board.garbled(at_s)
         return None if found is None else self._denied(seq, t_s, found)
 
@@ -220,7 +220,7 @@ class DangerMonitor(EmergencyRules):
         if not age_s <= limit_s:
             return conditions.EDGE_STALE.found("edge", age_s, limit_s)
         silent_s = self._edges.track.silence_s(t_s)
-        # Without its wheels it is not known where the robot went meanwhile.
+        # Without wheel samples the robot's motion is not known.
         return conditions.ENCODERS_STALE.found("enc", silent_s, limit_s) if silent_s > 0.0 else None
 
     def _estimate_missing(self, t_s: float, estimate: EstimateMessage | None) -> MonitorFinding | None:
@@ -232,7 +232,7 @@ class DangerMonitor(EmergencyRules):
             return conditions.ESTIMATE_STALE.found("estimate", age_s, limit_s)
         if isfinite(age_s + estimate.x_m + estimate.y_m + estimate.heading_rad + estimate.sigma_m):
             return None
-        # The values go out as JSON: an age that is not finite is no number there.
+        # The values are sent as JSON, which has no number for an age that is not finite.
         return conditions.ESTIMATE_NOT_FINITE.found("estimate", limit_s, limit_s)
 
     # -- arbitration ----------------------------------------------------------------------------------------------

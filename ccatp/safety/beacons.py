@@ -1,8 +1,7 @@
 """The danger rules of a robot among beacons: verdict and permits for each frame, from the frame and an estimate.
 
-Every rule looks at what the robot itself senses; of main's estimate only its uncertainty and its age count.
-
-They are the table of ``docs/beacon_missions.md``.
+The rules use the robot's own sensors. Of main's estimate they use only the uncertainty and the age. The table of the
+rules is in ``docs/beacon_missions.md``.
 """
 
 from collections import Counter, deque
@@ -30,15 +29,14 @@ from ccatp.safety.emergency_latch import EmergencyRules
 
 class _Obstacle(NamedTuple):
     time_s: float
-    x_m: float  # in the frame in which the robot stood when this memory began
+    x_m: float  # in the robot frame at the last reset
     y_m: float
 
 
 class ObstacleBuffer:
-    """Points in the frame of dead reckoning. Over its short memory that drifts by less than a sensor's noise.
+    """Recent echoes of the distance sensors, in the frame of dead reckoning.
 
-    Args:
-        reach_m: farther echoes are not kept.
+    Within ``memory_s`` dead reckoning drifts by less than a sensor's noise. Echoes beyond ``reach_m`` are not kept.
     """
 
     def __init__(self, sensors_rad: Sequence[float], reach_m: float, memory_s: float) -> None:
@@ -47,10 +45,9 @@ class ObstacleBuffer:
         self._x_m = self._y_m = self._heading_rad = self._steer_rad = 0.0
 
     def roll(self, way_m: float, course_rad: float, turn_rad: float) -> None:
-        """The robot has moved.
+        """Move the robot by ``way_m``, then turn it by ``turn_rad``.
 
-        Args:
-            course_rad: of the way, left of the heading before: the steering angle of a steered front wheel.
+        ``course_rad``: direction of the motion, left of the heading before it; the steering angle of a steered wheel.
         """
         along_rad = self._heading_rad + course_rad
         self._x_m += way_m * cos(along_rad)
@@ -58,7 +55,7 @@ class ObstacleBuffer:
         self._heading_rad += turn_rad
 
     def see(self, time_s: float, distances_m: Sequence[float]) -> None:
-        """Take the readings of a frame, in the order of the sensors, and forget what is old."""
+        """Add the readings of a frame, in the order of the sensors, and drop those older than the memory."""
         while self._echoes and time_s - self._echoes[0].time_s > self._memory_s:
             self._echoes.popleft()
         for angle_rad, distance_m in zip(self._sensors_rad, distances_m, strict=False):
@@ -68,7 +65,7 @@ class ObstacleBuffer:
                 self._echoes.append(_Obstacle(time_s, x_m, y_m))
 
     def nearest_m(self, course_rad: float, within_rad: float) -> float:
-        """Distance to the nearest point within an angle of a course left of the heading; infinite without one."""
+        """Distance to the nearest echo within ``within_rad`` of a course, left of the heading; infinite without one."""
         found = inf
         for echo in self._echoes:
             dx_m, dy_m = echo.x_m - self._x_m, echo.y_m - self._y_m
@@ -84,7 +81,7 @@ _NORMAL, _NEAR, _ABORTED = EventCode
 
 
 class BeaconSafetyRules(EmergencyRules):
-    """Judges frames. Call ``step`` once per frame, ``stale`` when no frame came in time."""
+    """Gives one verdict per frame. Call ``step`` for each frame, ``stale`` when no frame arrived in time."""
 
     code: EventCode = _NORMAL
 
@@ -95,7 +92,7 @@ class BeaconSafetyRules(EmergencyRules):
         super().__init__()
 
     def reset(self) -> None:
-        """The robot has booted: its clock starts again. Emergencies stay latched."""
+        """Begin again after a boot of the robot, whose clock has restarted. Emergencies stay latched."""
         super().reset()
         self._radio_s: float | None = None
         self._levels: deque[tuple[float, float]] = deque()
@@ -131,18 +128,18 @@ class BeaconSafetyRules(EmergencyRules):
         return self.latch.with_emergencies(verdict)
 
     def stale(self, seq: int, t_s: float) -> Verdict:
-        """The verdict when no frame came for ``stale_after_s``: nothing permitted."""
+        """The verdict when no frame arrived for ``stale_after_s``: no motion is permitted."""
         limit_s = self._danger.stale_after_s
         found = NO_FRAME.found("sensors", limit_s, limit_s)
         return self.latch.with_emergencies(found.verdict(seq, t_s, self._unmoved_code))
 
     def garbled(self, seq: int, t_s: float, _at_s: float) -> Verdict | None:
-        """A line of the robot was no frame: nothing permitted until the next one."""
+        """The verdict after a line that is not a frame: no motion is permitted until the next frame."""
         return self.stale(seq, t_s)
 
     @property
     def counts(self) -> dict[str, object]:
-        """Frames on which motion was denied, by signal."""
+        """Number of frames on which motion was denied, by signal."""
         return {"denied": dict(self._denials)}
 
     def _take_readings(self, t_s: float, extras: BeaconFrame) -> None:
@@ -225,7 +222,7 @@ class BeaconSafetyRules(EmergencyRules):
         return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True)
 
     def _nearest_target_m(self) -> float:
-        """The target is at least this far, by one standard deviation of its mean level; infinite without a level."""
+        """Lower bound of the target's distance: mean level minus one standard deviation; infinite without a level."""
         if not self._follow.is_active or not self._levels:
             return inf
         loss = self._loss

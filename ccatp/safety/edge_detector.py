@@ -1,4 +1,7 @@
-"""One edge sensor off the panels: where it went off, how far it has moved since, and when that is an edge."""
+"""One edge sensor that is off the panels: where it went off, how far it has moved since, and whether it is at an edge.
+
+An episode is the time from the first "off" of a sensor until it is safely back on a panel.
+"""
 
 from enum import Enum, auto
 from math import cos, hypot, inf, sin, sqrt
@@ -14,14 +17,14 @@ Axis = Literal["x", "y"]
 
 
 class SeamNear(NamedTuple):
-    """An interior seam near a place: the deck coordinate that is constant along it, and the signed distance, m."""
+    """An interior seam: ``axis`` is the deck coordinate that is constant along it; ``distance_m`` is signed."""
 
     axis: Axis
     distance_m: float
 
 
 class EdgeMap:
-    """Look-ups of the edge rule in the deck plane, metres."""
+    """Queries of the edge rule to the mirror's map, in the deck frame, m."""
 
     def __init__(self, mirror: Mirror) -> None:
         self._mirror = mirror
@@ -29,13 +32,13 @@ class EdgeMap:
         self.gap_m = mirror.gap_m
 
     def place(self, pose: tuple[float, float, float], offset_m: tuple[float, float]) -> tuple[float, float]:
-        """Deck (x, y) of a sensor at ``offset_m`` (robot frame) of a robot at ``pose`` (x, y, heading)."""
+        """Deck (x, y) of a sensor at ``offset_m`` (robot frame) when the robot is at ``pose`` (x, y, heading)."""
         return self._mirror.body_offset(DeckPose(*pose), *offset_m)
 
     def is_rim_ahead(
         self, place: tuple[float, float], direction: tuple[float, float], reach_m: float, slack_m: float
     ) -> bool:
-        """Whether a sensor at deck ``place`` that moves along the deck unit vector ``direction`` meets the rim."""
+        """Whether the rim is within ``slack_m`` of the next ``reach_m`` from ``place`` along the unit ``direction``."""
         x, y = place
         if self._rim.signed_distance_m(x, y) > reach_m + slack_m:
             return False
@@ -47,11 +50,14 @@ class EdgeMap:
         return self._rim.signed_distance_m(*place) <= 0.0
 
     def has_edge_near(self, place: tuple[float, float], slack_m: float) -> bool:
-        """Whether a panel may end within ``slack_m`` of a place: at a seam or at the rim."""
+        """Whether a seam or the rim is within ``slack_m`` of a place."""
         return self._rim.signed_distance_m(*place) <= slack_m or self.seam_at(place, slack_m) is not None
 
     def seam_at(self, place: tuple[float, float], slack_m: float, not_axis: Axis | None = None) -> SeamNear | None:
-        """The nearest interior seam, not of ``not_axis``, whose gap, ``slack_m`` wider on both sides, holds a place."""
+        """The nearest interior seam whose gap, widened by ``slack_m`` on both sides, contains a place.
+
+        Seams of ``not_axis`` are left out.
+        """
         x, y = place
         panel = self._mirror.panels[self._mirror.nearest_panel(x, y)]
         half_gap = 0.5 * self.gap_m
@@ -73,17 +79,17 @@ class EdgeMap:
 
 Place = tuple[float, float]
 
-# The direction of a sensor's motion is taken over this length: far above what encoder noise adds up to at rest (1e-5 m
-# a minute), far below what a rule allows.
+# Length over which the direction of a sensor's motion is computed: far above the encoder noise at rest (1e-5 m per
+# minute), far below every limit of the rules.
 DIRECTION_TRAVEL_M = 2e-4
-# Below this cosine the side from which a sensor came to a seam is not given by its direction any more.
+# Below this cosine the direction of motion does not show from which side a sensor came to a seam.
 MIN_SIDE_COSINE = 0.3
-# A sensor that stays on this many times longer than it takes to clear an edge is on a panel, moving or not.
+# A sensor that stays on for this many times ``clear_samples`` is on a panel, even if it does not move.
 LONG_ON = 10
 
 
 class EdgePhase(Enum):
-    """What is known of an episode."""
+    """How the map explains an episode."""
 
     FRESH = auto()  # the sensor has not moved since it went off
     SEAM = auto()  # the map explains it by a seam
@@ -100,20 +106,21 @@ class EdgeLimits:
         self.gap_m, self.tolerance_m, self.extra_m = gap_m, cfg.gap_tolerance_m, cfg.seam_extra_m
         self.no_map_m, self.turn_m = cfg.no_map_travel_m, cfg.turn_travel_limit_m
         width = gap_m + cfg.gap_tolerance_m
-        # A narrow seam may be crossed at a greater slant: what counts in the end is how far the sensor may go.
+        # A narrow seam may be crossed at a larger angle, because the limit is the length that the sensor travels.
         self.min_cosine = min(cos(cfg.max_crossing_angle_rad), width / cfg.slanted_crossing_m)
-        # Where seams cross, a path that is oblique to one is steep to the other: more than both chords is no crossing.
+        # Where two seams cross, a path oblique to one is steep to the other. A crossing of both is never longer than
+        # the sum of the two chords.
         self.crossing_m = width / self.min_cosine + width / sqrt(1.0 - self.min_cosine**2) + cfg.seam_extra_m
         self.outward_turn_m = cfg.outward_turn_limit_m
         self.debounce, self.clear = cfg.debounce_samples, cfg.clear_samples
 
 
 class EdgeDetector:
-    """A sensor's time off the panels. Places are in the odometry's frame unless called map places.
+    """One episode of one sensor. Places are in the frame of the odometry unless they are called map places.
 
-    ``sensor``: its place in the robot frame, and how far it moves between two samples, which is how late it may have
-    been noticed, m. Less translation than ``half_base_m`` per radian means turning in place. ``retreat_m``: how far the
-    sensor has been moved since it was declared, while it stayed off.
+    ``sensor``: its place in the robot frame, and how far it moves between two samples, m (the detection may be late by
+    this distance). Less translation than ``half_base_m`` per radian counts as a turn in place. ``retreat_m``: how far
+    the sensor has moved since the edge was declared, while it stayed off.
     """
 
     def __init__(
@@ -154,23 +161,23 @@ class EdgeDetector:
         self.retreat_m = 0.0
         self.is_doubted = False
         self.phase = EdgePhase.FRESH
-        self.cause: Condition = NO_SEAM  # once it is declared
+        self.cause: Condition = NO_SEAM  # valid once an edge is declared
         self.value_m = self.limit_m = 0.0
 
     def place_on_map(self, place: Place, deck_heading_rad: float, sigma_m: float) -> None:
-        """Tie the episode to the map: the sensor's deck place, the robot's deck heading and the estimate's sigma."""
+        """Set the sensor's place on the map, the robot's deck heading and the standard deviation of the estimate."""
         turn = deck_heading_rad - self._heading0
         self._map0, self._cos, self._sin, self._sigma_m = place, cos(turn), sin(turn), sigma_m
 
     @property
     def needs_map(self) -> bool:
-        """Whether the sensor still is where it went off, but without a place on the map."""
+        """Whether the sensor has no place on the map and has not moved since it went off."""
         return self.phase is EdgePhase.FRESH and self._map0 is None
 
     # -- samples --------------------------------------------------------------------------------------------------
 
     def see_on(self, place: Place) -> bool:
-        """The sensor is on a panel at ``place``. Returns whether the episode is over."""
+        """Take an "on" sample at ``place``. Returns whether the episode is over."""
         if self._on_samples == 0:
             self._on_place = place
         self._on_samples += 1
@@ -181,7 +188,7 @@ class EdgeDetector:
         return hypot(place[0] - self._on_place[0], place[1] - self._on_place[1]) >= self._limits.no_map_m
 
     def see_off(self, odometry: Odometry, place: Place, worst_m: float) -> bool:
-        """The sensor is off; whether that declares an edge. ``worst_m``: travel that silent wheels add, rule (g)."""
+        """Take an "off" sample; whether it declares an edge. ``worst_m``: largest unmeasured travel, rule (g)."""
         self._off_samples += 1
         self._on_samples = 0
         self._heading, self._place = odometry.heading_rad, place
@@ -202,7 +209,7 @@ class EdgeDetector:
         return self._judge(robot)
 
     def look_ahead(self) -> bool:
-        """Rule (a) along the motion since the last call. Returns whether that declares an edge now."""
+        """Apply rule (a) along the motion since the last call. Returns whether it declares an edge."""
         dx, dy = self._moved[0] - self._recent[0], self._moved[1] - self._recent[1]
         length = hypot(dx, dy)
         if self._on_samples or self._map0 is None or length < DIRECTION_TRAVEL_M or self.phase is EdgePhase.FRESH:
@@ -214,17 +221,17 @@ class EdgeDetector:
         return self._off_samples >= self._limits.debounce and self._declare_rim()
 
     def trust(self) -> None:
-        """The sensor is right after all: moved back from where it is now, it comes on."""
+        """A fix confirms that the sensor is correct: measure the retreat again, from here."""
         self._declared_place, self.retreat_m, self.is_doubted = self._place, 0.0, False
 
     @property
     def is_on(self) -> bool:
-        """The sensor is on at present: the episode may be about to end."""
+        """Whether the last sample was "on"; the episode may be about to end."""
         return self._on_samples > 0
 
     @property
     def permits_turn(self) -> bool:
-        """Whether the robot may turn: back, out of an edge that it met in turning."""
+        """Whether the robot may turn. At a declared edge: only when a turn led there, to turn back."""
         return self.phase is not EdgePhase.DECLARED or (self.is_from_turn and not self._is_turn_spent)
 
     # -- rules ----------------------------------------------------------------------------------------------------
@@ -249,7 +256,7 @@ class EdgeDetector:
             self._set_seam(seam.axis)
 
     def _slack_m(self) -> float:
-        """How far off it may be across a seam. The extra is the heading's part: 3 mm are 1.3 deg at a corner."""
+        """Allowance across a seam, m. ``extra_m`` covers the heading's error: 3 mm are 1.3 deg at a corner sensor."""
         limits = self._limits
         return limits.tolerance_m + limits.extra_m + limits.sigmas * self._sigma_m + self._moved_m
 
@@ -262,7 +269,7 @@ class EdgeDetector:
     def _set_seam(self, axis: Axis) -> None:
         self._axis = axis
         across = self._direction[0] if axis == "x" else self._direction[1]
-        # Only where the robot's own translation brought the sensor here does its direction distinguish forth and back.
+        # The direction tells forward from back only if the robot's translation, not a turn, brought the sensor here.
         known = not self.is_from_turn and not self._has_switched and abs(across) >= MIN_SIDE_COSINE
         self._side = (1.0 if across > 0.0 else -1.0) if known else 0.0
 
@@ -291,7 +298,7 @@ class EdgeDetector:
         return self._declare(BEYOND_SEAM, value, limit)
 
     def _seam_excess(self, robot: Place) -> tuple[float, float]:
-        """The travel that is over its limit, and that limit; else what translation has used up of its allowance."""
+        """Rule (b): the first travel that exceeds its limit, and that limit; else the translation and its limit."""
         limits = self._limits
         k = 0 if self._axis == "x" else 1
         width = limits.gap_m + limits.tolerance_m
@@ -316,7 +323,7 @@ class EdgeDetector:
         return travel, width / cosine + limits.extra_m
 
     def _switch_seam(self, robot: Place) -> bool:
-        """Where two seams cross, a sensor may leave one along the other: once, that is no edge."""
+        """Where two seams cross, a sensor may leave one seam along the other. Once per episode this is not an edge."""
         if self._has_switched or self._map0 is None or hypot(*robot) > self._limits.crossing_m:
             return False
         here = self._map0[0] + self._moved[0], self._map0[1] + self._moved[1]

@@ -1,25 +1,24 @@
-"""Edge or gap, by travelled distance with the map as prior: one episode per sensor that is off the panels.
+"""Edge or gap? Decided by the distance travelled, with the map as prior; one episode per sensor off the panels.
 
-The rule, for a sensor that reads "off" (the travel is the sensor's own, its part from the robot's rotation included):
+The rules for a sensor that reads "off" (travel: of the sensor itself, with the part from the robot's rotation):
 
-a. the map has the rim ahead of it within ``map_margin_m``, give or take ``map_sigmas`` sigma: an edge at once;
-b. the map has a seam there: an edge when the sensor cannot be over the gap any more. Translation of the robot may carry
-   it ``(gap + tolerance) / cos(angle to the seam's normal) + extra``; what rotation adds counts across the seam only,
-   because a corner sensor that turns in place sweeps along a seam for up to 0.1 m without leaving it;
-c. the map has neither, or there is no estimate: an edge after ``no_map_travel_m``;
-d. standing still the episode is frozen, for ever; going back to where the sensor was on adds nothing;
-e. an edge may have been declared by a wrong pose: a sensor that a fix at rest shows over a seam with no rim near begins
-   again there, and one that it shows at the rim is not to blame for staying off;
-g. wheels without samples: the fastest that the sensor can move, times the time;
-h. all four off: lifted or fallen.
+a. The map shows the rim ahead within ``map_margin_m`` plus ``map_sigmas`` sigma: an edge at once.
+b. The map shows a seam: an edge when the sensor cannot be over the gap any more. The robot's translation may carry it
+   ``(gap + tolerance) / cos(angle to the seam's normal) + extra``. Rotation counts only across the seam, because a
+   corner sensor that turns in place sweeps along a seam for up to 0.1 m without leaving it.
+c. The map shows neither, or there is no estimate: an edge after ``no_map_travel_m``.
+d. While the robot stands, the episode does not change. Motion back to where the sensor was on adds no travel.
+e. A wrong pose may have declared an edge. If a fix at rest shows the sensor over a seam with no rim near, a new episode
+   starts there. If it shows the sensor at the rim, the sensor is not faulty although it stays off.
+g. Without wheel samples, the travel is the sensor's largest speed times the elapsed time.
+h. All four sensors off: the robot is lifted or has fallen.
 
-An episode ends when the sensor has stood on a panel for ``clear_samples`` samples and has moved on by
-``no_map_travel_m``, so that a sensor that chatters does not begin again and again.
+An episode ends when the sensor has been on a panel for ``clear_samples`` samples and has moved on by
+``no_map_travel_m``, so that a sensor that chatters does not start one episode after the other.
 
-The robot's centre and the rim on the map: a notch's tip passes between the edge sensors unseen. At an inner corner of
-the stepped rim the empty quadrant points at the robot like a wedge. Along its bisector the front sensors, 180 mm apart,
-leave the panels only when its tip has come under the centre. The map shows it where the position is known; where it is
-not, four corner sensors cannot.
+``CentreClearanceCheck`` covers what the edge sensors cannot detect: at an inner corner of the stepped rim the empty
+quadrant is a wedge, and its tip can pass between the front sensors, 180 mm apart, until it is under the robot's centre.
+The map shows the tip where the position is known.
 """
 
 from collections.abc import Sequence
@@ -34,18 +33,18 @@ from ccatp.safety.edge_detector import EdgeDetector, EdgeLimits, EdgeMap, EdgePh
 from ccatp.safety.wheel_odometry import Odometry, WheelTrack, pose_at
 
 SENSORS = 4
-# Slower than this the robot stands; the estimate's sigma then falls to less than half by a fix, and by nothing else.
+# Below this speed the robot stands. At rest only a fix can reduce the estimate's sigma to less than half.
 _STILL_M_S = 5e-4
 _BY_A_FIX = 0.5
-# A fix shows where the robot is, but not at once what it faces: an estimate that was wrong mostly is so in its heading.
+# Heading error that a fix may leave: a fix corrects the position at once, but not the heading.
 _HEADING_RAD = 0.1
 
 
 class EdgeRule:
-    """The four sensors' episodes and what they declare.
+    """The episodes of the four sensors.
 
-    ``is_lifted``: all four sensors have been off (rule h), and have not been back on for ``clear_samples``. ``opened``
-    and ``declared`` count episodes and edges per sensor since the start.
+    ``is_lifted``: all four sensors have been off (rule h), and have not yet been on again for ``clear_samples``.
+    ``opened`` and ``declared`` count episodes and edges per sensor since the start.
     """
 
     def __init__(self, edge_map: EdgeMap, robot: RobotConfig, cfg: DangerConfig) -> None:
@@ -60,7 +59,7 @@ class EdgeRule:
         self.reset()
 
     def reset(self) -> None:
-        """Forget episodes, odometry and times: the robot's clock was reset."""
+        """Drop episodes, odometry and times, because the robot's clock has restarted."""
         robot = self._robot
         self.track = WheelTrack(
             robot.wheel_radius_m, robot.wheel_base_m, self._stale_after_s, self._reach_s, largest_rate_rad_s(robot)
@@ -74,11 +73,14 @@ class EdgeRule:
 
     @property
     def is_idle(self) -> bool:
-        """No episode is open, nor is the robot lifted."""
+        """Whether no episode is open and the robot is not lifted."""
         return self._odometry is None
 
     def step(self, samples: list[EdgeSample], estimate: EstimateMessage | None) -> None:
-        """Judge a frame's samples; its encoder samples are in ``track``. ``estimate`` is fresh and finite, or None."""
+        """Evaluate a frame's samples.
+
+        The frame's encoder samples must be in ``track`` already. ``estimate`` is fresh and finite, or None.
+        """
         if not samples:
             return
         if self._odometry is None and _are_all_on(samples):
@@ -92,7 +94,7 @@ class EdgeRule:
             if self._last_t_s is None or sample[0] > self._last_t_s:
                 self._sample(sample, self._odometry, estimate)
                 self._last_t_s = sample[0]
-        # Rule (a) again, once per frame, for what is off and moves: a seam may lead to the rim.
+        # Rule (a) again, once per frame, for a sensor that is off and moves: a seam may lead to the rim.
         for i, episode in enumerate(self.episodes):
             if episode is not None and episode.phase is not EdgePhase.DECLARED and episode.look_ahead():
                 self.declared[i] += 1
@@ -109,7 +111,7 @@ class EdgeRule:
         c, s = cos(odometry.heading_rad), sin(odometry.heading_rad)
         off = 0
         for i, known in enumerate(self.episodes):
-            # Anything but a clear "on" counts as off.
+            # Every value other than 1 counts as off.
             is_on = sample[i + 1] == 1
             if is_on and known is None:
                 continue
@@ -136,7 +138,7 @@ class EdgeRule:
         return has_fix
 
     def _look_again(self, odometry: Odometry, estimate: EstimateMessage) -> None:
-        """A sensor that a fix shows over a seam begins again there; one at the rim is not to blame for staying off."""
+        """Rule (e), after a fix at rest."""
         limits = self._limits
         for i, episode in enumerate(self.episodes):
             if episode is None or episode.phase is not EdgePhase.DECLARED or episode.is_on:
@@ -192,24 +194,23 @@ def _are_all_on(samples: list[EdgeSample]) -> bool:
 
 
 def _fastest(robot: RobotConfig, offset_m: tuple[float, float]) -> float:
-    """Largest speed of a sensor, m/s: it is linear in the wheel rates, so it is taken at a corner of their range."""
+    """Largest speed of a sensor, m/s. It is linear in the wheel rates, so its maximum is at a corner of their range."""
     edge_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
     omega = 2.0 * edge_m_s / robot.wheel_base_m
     return max(edge_m_s, omega * hypot(*offset_m))
 
 
-# Where the clearance is wide, it is looked up this often at least: a fix may move the estimate.
+# Longest time between two look-ups of a large clearance: a fix may move the estimate.
 LOOK_PERIOD_S = 0.1
-# Sum of the wheel rates that is motion and not encoder noise (0.3 mm/s).
+# Sum of the wheel rates above which the robot moves: encoder noise is below it (0.3 mm/s).
 MOVING_RAD_S = 0.02
 
 
 class CentreClearanceCheck:
-    """Declares an edge when the centre drives at the rim and is closer to it than half the sensors' lead.
+    """Declares an edge when the centre moves towards the rim and is closer to it than half the sensors' lead.
 
-    A straight rim never gets that close: the sensors meet it first. Ends when the centre is ``map_margin_m`` further
-    away than it takes to declare. ``direction``: 0, or the sign of the barred motion; ``clearance_m`` at the last look
-    must not fall below ``limit_m``.
+    At a straight rim the sensors go off before that. It ends when the clearance exceeds the limit by ``map_margin_m``.
+    ``direction``: sign of the barred motion, or 0. ``clearance_m``: at the last look-up; ``limit_m``: its least value.
     """
 
     def __init__(self, rim: Rim, robot: RobotConfig, cfg: DangerConfig) -> None:
@@ -222,7 +223,7 @@ class CentreClearanceCheck:
         self._look_at_s = -inf
 
     def step(self, t_s: float, estimate: EstimateMessage, wheels: Sequence[WheelSample]) -> None:
-        """Look up the clearance, where it may have come near the limit."""
+        """Look up the clearance if the robot can have come near the limit since the last look-up."""
         if t_s < self._look_at_s:
             return
         x, y = estimate.x_m, estimate.y_m

@@ -1,4 +1,4 @@
-"""Emergencies of the observatory: latched, one entry per id, each with its clear condition; answers to requests."""
+"""Emergencies of the observatory: the latch with one entry per id, and the replies to the observatory's requests."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from ccatp.links.channels import (
     uuid_of,
 )
 
-# An observatory has a handful at a time; a peer that floods the latch must not fill the memory.
+# An observatory reports a few at a time. The bounds keep a peer from filling the memory.
 MAX_ACTIVE = 256
 MAX_CLEARED = 1024
-# Main acts on a verdict in the frame after it at the latest; an estimate of a later frame takes it into account.
+# Main acts on a verdict one frame later at the latest, so its estimate of a later frame takes the verdict into account.
 INFORMED_AFTER_FRAMES = 2
 # The mission's states (``ccatp.survey.events``) in which the robot stands at base or is held.
 AT_BASE_OR_HELD = frozenset({"idle", "held", "done"})
@@ -38,9 +38,9 @@ class Emergency:
 class EmergencyLatch:
     """Code 2 holds while any emergency is active.
 
-    Each id is raised once, repeated without effect, and cleared once. A ``clear`` reports that the cause of that id is
-    gone; it is refused while a level input says that the cause persists (``set_level``), while the robot is neither at
-    base nor held, and for an id that was never raised. ``raised`` counts the emergencies latched so far.
+    Each id is raised once and cleared once; repeats have no effect. A clear is refused while a level input reports that
+    the cause persists (``set_level``), while the robot is neither at base nor held, and for an id that was never
+    raised. ``raised`` counts the emergencies latched so far.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class EmergencyLatch:
 
     @property
     def is_shaking(self) -> bool:
-        """Whether an earthquake is active: nothing may move until it is cleared, whatever else there is."""
+        """Whether an earthquake is active: no motion is permitted until it is cleared."""
         return any(emergency.kind is EmergencyKind.EARTHQUAKE for emergency in self._active.values())
 
     @property
@@ -66,44 +66,44 @@ class EmergencyLatch:
 
     @property
     def causes(self) -> list[str]:
-        """Of each kind that is active, as it is shown."""
+        """The text of each active kind, as operators see it."""
         return [EMERGENCY.text(kind=kind) for kind in dict.fromkeys(one.kind for one in self._active.values())]
 
     def verdict(self, seq: int, t_s: float) -> Verdict | None:
-        """That of the newest emergency, ``None`` without one; motion is permitted: the robot shall drive home."""
+        """Verdict of the newest emergency, or ``None``. Motion is permitted, because the robot shall drive home."""
         newest = self.newest
         if newest is None:
             return None
-        # Whoever drives while the ground shakes slips; the others are fled from.
+        # A robot that moves in an earthquake slips. From the other emergencies it drives home.
         kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.is_shaking else (newest.kind, True)
         cause, signal = EMERGENCY.text(kind=kind), f"emergency:{kind}"
         return Verdict(seq, t_s, EventCode.ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
 
     def with_emergencies(self, verdict: Verdict) -> Verdict:
-        """A verdict, with what it does not say of emergencies where something else gave its code."""
+        """A verdict with the state of the latch added, because its code may come from another rule."""
         if not self._active:
             return verdict
         return msgspec.structs.replace(verdict, raised=self.raised, is_shaking=self.is_shaking)
 
     def holds(self, emergency_id: str) -> bool:
-        """Whether the emergency with that id is active."""
+        """Whether the emergency with this id is active."""
         return emergency_id in self._active
 
     def set_level(self, kind: EmergencyKind, active: bool) -> None:
-        """State of a lasting input (a fire panel's contact, a seismometer's alarm): no clear of that kind while on."""
+        """Set a level input (contact of a fire panel, alarm of a seismometer). While on, its kind cannot be cleared."""
         (self._levels.add if active else self._levels.discard)(kind)
 
     def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        """Latch an emergency; why it was refused, or None. The same id again, also after its clear, has no effect."""
+        """Latch an emergency; returns why it was refused, or None. A repeated or cleared id has no effect."""
         if emergency_id in self._cleared:
             return None
-        # The same id is the same emergency, whatever is said of it; but one that shakes the robot holds it.
+        # A known id keeps its kind, except that it may become an earthquake, which holds the robot.
         known = self._active.get(emergency_id)
         if known is not None and (kind != EmergencyKind.EARTHQUAKE or known.kind is EmergencyKind.EARTHQUAKE):
             return None
         if kind not in EmergencyKind.__members__.values():
             return f"unknown kind {kind!r}"
-        # Whoever fills the latch with one kind does not keep the others out.
+        # When the latch is full, the first emergency of each kind is still accepted.
         has_room = known is not None or len(self._active) < MAX_ACTIVE
         if not has_room and any(emergency.kind == kind for emergency in self._active.values()):
             return f"{MAX_ACTIVE} emergencies are active already (the operation is aborted)"
@@ -112,7 +112,7 @@ class EmergencyLatch:
         return None
 
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        """End one emergency; returns why it was refused, or None. Clearing a cleared id has no effect."""
+        """Clear one emergency; returns why it was refused, or None. A cleared id has no effect."""
         if emergency_id in self._cleared:
             return None
         emergency = self._active.get(emergency_id)
@@ -130,13 +130,11 @@ class EmergencyLatch:
 
 
 class EmergencyRules:
-    """What the observatory asks of the rules of a robot, of whatever kind.
+    """Base of the danger rules of each kind of robot: the emergencies of the observatory.
 
-    A subclass keeps the number of the newest frame and main's newest word: the state
-    of the mission, empty where it is not known, and the frame of which it was said.
-
-    Attributes:
-        found: what the monitors found in that frame.
+    A subclass sets ``_frame_seq``, the newest frame, and ``_state`` and ``_state_seq``: the mission's state in main's
+    newest estimate (empty: not known) and the frame of that estimate. ``found``: findings of the monitors in the newest
+    frame.
     """
 
     found: Sequence[MonitorFinding] = ()
@@ -150,20 +148,20 @@ class EmergencyRules:
 
     def reset(self) -> None:
         """Begin a new session with the robot (its clock and numbers start again). Emergencies stay latched."""
-        self._raised_seq = -INFORMED_AFTER_FRAMES - 1  # the frame in which the newest emergency was raised
+        self._raised_seq = -INFORMED_AFTER_FRAMES - 1  # newest frame when the newest emergency was raised
 
     @property
     def code(self) -> EventCode:
-        """The event code now, of emergencies alone."""
+        """The event code, from emergencies alone."""
         return EventCode.ABORTED if self.latch.is_latched else EventCode.NORMAL
 
     @property
     def at_base_or_held(self) -> bool:
-        """Whether main's newest estimate says so, and takes the newest emergency into account."""
+        """Whether main reports so, in an estimate that takes the newest emergency into account."""
         return self._state_seq > self._raised_seq + INFORMED_AFTER_FRAMES and self._state in AT_BASE_OR_HELD
 
     def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        """Latch an emergency; returns why it was refused, or None. The same id again is harmless."""
+        """Latch an emergency; returns why it was refused, or None. A repeated id has no effect."""
         before = self.latch.raised
         refusal = self.latch.raise_emergency(kind, emergency_id, note)
         if self.latch.raised != before:
@@ -171,14 +169,14 @@ class EmergencyRules:
         return refusal
 
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        """End an emergency; returns why it was refused, or None."""
+        """Clear an emergency; returns why it was refused, or None."""
         return self.latch.clear(emergency_id, at_base_or_held)
 
 
 def answer_observatory(
     frame: bytes, handler: EmergencyRules, *, at_base_or_held: bool, age_s: float | None, may_clear: bool = True
 ) -> bytes:
-    """The reply to one request of the observatory channel; ``age_s`` of the last verdict, ``None`` before the first."""
+    """The reply to a request on the observatory channel. ``age_s``: of the last verdict, ``None`` before the first."""
     try:
         request = parse_observatory(frame)
     except BadRequest as error:
@@ -188,8 +186,8 @@ def answer_observatory(
     key = uuid_of(request.id)
     if isinstance(request, EmergencyRequest):
         refusal = handler.emergency(request.kind.value, key, request.note)
-        # An edge may hide the abort's code until the robot is off it; the answer is about the latch. What was cleared
-        # before is not latched again: whoever means another emergency has to know.
+        # The reply shows the latch, because the code of an edge may hide that of the abort. A cleared id is not latched
+        # again; the reply says so, because the client may mean another emergency.
         is_held = handler.latch.holds(key)
         accepted = format_ok(id=request.id, latched=is_held, code=int(EventCode.ABORTED if is_held else handler.code))
     elif not may_clear:

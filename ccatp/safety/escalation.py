@@ -1,4 +1,4 @@
-"""Findings of the monitors: how long they stay, which one wins, and when they become graver."""
+"""Findings of the monitors: how long they last, which one takes precedence, and when their severity is raised."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ from ccatp.core import Severity
 
 
 class FindingLatch:
-    """A finding that stays until there has been no evidence of it for a while."""
+    """Keeps a finding until there has been no evidence of it for ``clear_s``."""
 
     __slots__ = ("_clear_s", "_seen_s", "finding")
 
@@ -19,20 +19,20 @@ class FindingLatch:
         self.finding: MonitorFinding | None = None
 
     def see(self, t_s: float, finding: MonitorFinding) -> None:
-        """There is evidence at ``t_s``. The first values are kept, unless it has become graver."""
+        """Take evidence at ``t_s``. The first finding is kept unless the new one is more severe."""
         if self.finding is None or finding.severity > self.finding.severity:
             self.finding = finding
         self._seen_s = t_s
 
     def settle(self, t_s: float) -> MonitorFinding | None:
-        """The finding, which is let go if its last evidence is long ago at ``t_s``."""
+        """The finding, or ``None`` when its last evidence is ``clear_s`` old at ``t_s``."""
         if self.finding is not None and t_s - self._seen_s >= self._clear_s:
             self.finding = None
         return self.finding
 
 
 class Since:
-    """Since when something has been so without interruption (``None`` while it is not so)."""
+    """Measures how long a condition has been true without interruption. ``t_s``: when it became true, or ``None``."""
 
     __slots__ = ("t_s",)
 
@@ -40,7 +40,7 @@ class Since:
         self.t_s: float | None = None
 
     def lasts(self, t_s: float, is_so: bool) -> float:
-        """For how long it has been so at ``t_s``, s; < 0 while it is not."""
+        """How long the condition has been true at ``t_s``, s; -1 while it is false."""
         if not is_so:
             self.t_s = None
             return -1.0
@@ -53,21 +53,21 @@ _DENYING = (Severity.PAUSE, Severity.HOLD, Severity.FAULT)
 
 
 def gravest(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
-    """The finding that wins: the gravest, of equal ones that of the first row."""
+    """The finding with the highest severity; of equal ones that of the first row in the table of conditions."""
     return max(findings, key=lambda finding: (finding.severity, PRECEDENCE[finding.condition]), default=None)
 
 
 def denies(findings: Iterable[MonitorFinding]) -> bool:
-    """Whether any of the findings holds the wheels. Going home does not, but what else is found may."""
+    """Whether any finding holds the wheels. A RETURN, although more severe than a hold, does not."""
     return any(finding.severity in _DENYING for finding in findings)
 
 
 class SeverityEscalation:
-    """Raises the severity of what lasts or comes back.
+    """Raises the severity of findings that last or repeat.
 
-    A pause that lasts for longer than ``pause_limit_s`` is a hold, so that a fix is taken before going on; a hold that
-    lasts for longer than its limit is a fault, because it does not pass by itself; a hold for the same signal that
-    comes more than ``retries`` times again within ``retry_window_s`` is one, too.
+    A pause longer than ``pause_limit_s`` becomes a hold, so that a fix is taken before the mission continues. A hold
+    longer than its limit becomes a fault, because it does not end by itself. A hold for the same signal that repeats
+    more than ``retries`` times within ``retry_window_s`` becomes a fault, too.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
@@ -77,11 +77,11 @@ class SeverityEscalation:
 
     @property
     def is_counting(self) -> bool:
-        """Something was found in the last frame."""
+        """Whether the last frame had findings."""
         return bool(self._since_s)
 
     def climb(self, t_s: float, findings: list[MonitorFinding]) -> list[MonitorFinding]:
-        """All findings of a frame, raised where their time is up; an empty list ends every count of duration."""
+        """The findings of a frame with raised severities. An empty list ends all durations."""
         since = self._since_s
         now: dict[str, float] = {}
         for finding in findings:

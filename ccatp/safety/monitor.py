@@ -1,4 +1,4 @@
-"""All monitors of the danger loop but the edge rule, frame by frame, and what they find together."""
+"""The monitors of the danger loop except the edge rule: one step per frame, and their findings."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -26,15 +26,15 @@ from ccatp.safety.sensor_monitors import (
 from ccatp.safety.wheel_monitors import LATE_S, GripMonitor, WheelMonitor
 
 _STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s
-_LOOK_FRAMES = 2  # the monitors judge one frame in so many while nothing is wrong; sums are kept in every one
-_SLOW_LOOK_FRAMES = 10  # what changes slowly is looked at this often
-# What the gyroscope shows at rest is bounded: garbage must not move it far.
+_LOOK_FRAMES = 2  # while nothing is wrong, the monitors judge every second frame; the sums take all frames
+_SLOW_LOOK_FRAMES = 10  # period of the monitors of slow quantities
+# The gyroscope's bias, averaged at rest. Readings are bounded, so that garbage cannot move it far.
 _BIAS_TIME_S = 0.5
 _LARGEST_BIAS_RAD_S = 0.35
 
 
 class HealthMonitor:
-    """All monitors but the edge rule's. ``is_explained``: the map has a panel's edge near the sensor of an index."""
+    """All monitors except the edge rule. ``is_explained``: whether the map has a panel's edge near the i-th sensor."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class HealthMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Another boot of the robot. What was found of battery, gyroscope and blind edge sensors stays."""
+        """Begin again after a boot of the robot. Battery, gyroscope bias and missed seams are kept."""
         cfg, robot = self._cfg, self._robot
         self._gate = ImuGate(cfg)
         self._wheels, self._rates, self._latency = WheelMonitor(cfg, robot), RateMonitor(cfg), LatencyMonitor(cfg)
@@ -81,14 +81,14 @@ class HealthMonitor:
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def jumped(self, t_s: float, by_s: float) -> None:
-        """The robot's clock has jumped before the frame at ``t_s``."""
+        """Report that the robot's clock jumped before the frame at ``t_s``."""
         finding = conditions.CLOCK_JUMPED.found("clock", by_s, self._cfg.clock_jump_s)
         self._clock.see(t_s, finding)
         self._gate.reset()
         self.findings = [finding]
 
     def garbled(self, at_s: float) -> MonitorFinding | None:
-        """A line at ``at_s``, any monotonic clock, was no frame; of too many, what stays until frames come."""
+        """Count a line that is not a frame, at ``at_s`` on any monotonic clock; the finding if there are too many."""
         times_s, lines = self._garbled_s, float(self._cfg.garbled_lines)
         times_s.append(at_s)
         if at_s - times_s[0] > self._cfg.garbled_window_s:
@@ -108,7 +108,7 @@ class HealthMonitor:
         is_permitted: bool,
         is_any_off: bool,
     ) -> None:
-        """Look at a frame; ``is_any_off``: an edge sensor is off, or has just been."""
+        """Take a frame; ``is_any_off``: an edge sensor is off, or was off a moment ago."""
         dt_s = 0.0 if self._t_s is None else t_s - self._t_s
         self._t_s = t_s
         is_gap = dt_s > self._cfg.gap_s
@@ -157,13 +157,15 @@ class HealthMonitor:
             self._battery.step(t_s, frame.soc, "battery_low" in frame.faults, self._home_m)
 
     def _added(self, imu: Sequence[ImuSample], dt_s: float) -> MotionSum:
-        """The sums with this frame's motion. What is not known of it is taken to be none, of all."""
+        """The sums with this frame's motion; all unchanged if a wheel's rate is unknown, to keep them consistent.
+
+        Without a usable inertial unit the turn is that of the wheels.
+        """
         means, (_, right_m, left_m, turned_rad) = self._means, self._sums
         right, left = means.right_rad_s, means.left_rad_s
         usable = self._gate.admit(imu, means.yaw_rad_s) if imu else imu
         t_s = self._t_s or 0.0
         if right is None or left is None:
-            # Without one of them none is counted, so that they do not disagree about what is not known.
             return t_s, right_m, left_m, turned_rad
         rolled_m = self._robot.wheel_radius_m * dt_s
         if usable:
@@ -179,7 +181,7 @@ class HealthMonitor:
         return t_s, right_m + right * rolled_m, left_m + left * rolled_m, turned_rad + turned
 
     def take_commands(self, t_s: float, estimate: EstimateMessage) -> None:
-        """Take the set points from an estimate, too old or not; a repeated one changes nothing."""
+        """Take the set points from an estimate of any age; a repeated one has no effect."""
         if estimate.seq == self._commands_seq:
             return
         self._commands_seq = estimate.seq
@@ -187,7 +189,7 @@ class HealthMonitor:
             self._wheels.take_commands(t_s, estimate.commanded)
 
     def learn(self, t_s: float, estimate: EstimateMessage, opened: Sequence[int], is_off: Sequence[object]) -> None:
-        """Take a fresh estimate; a repeated one changes nothing. ``opened``: how often each edge sensor went off."""
+        """Take a fresh estimate; a repeated one has no effect. ``opened``: how often each edge sensor went off."""
         if estimate.seq == self._estimate_seq:
             return
         self._estimate_seq = estimate.seq

@@ -1,4 +1,4 @@
-"""Edge sensors that chatter, flash or are blind at seams; sample rates, latency of the link, framing errors."""
+"""Monitors of edge sensors (chatter, flashes, missed seams), sample rates, link latency, fans and battery."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -12,20 +12,20 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import FindingLatch, Since
 
 _CORNERS = tuple(corner.value for corner in Corner)
-# Slower than this nothing crosses an edge; vibration moves a sensor by less in a frame.
+# Below this speed no sensor crosses an edge.
 _STILL_M_S = 0.002
 _CLEAR_S = 0.2
 
 
 class FlickerMonitor:
-    """Judges the changes of the edge sensors, in frames in which any of them is off or has been.
+    """Judges the transitions of the edge sensors, in frames in which a sensor is off or was off a moment ago.
 
-    * More transitions than allowed in a short time where the map has no edge of a panel: chatter, a hold.
-    * A sensor that goes off while the wheels stand where the map has no edge: a pause until it is on again, for at
-      most ``pause_limit_s``; then the edge rule decides, and the robot goes slowly.
+    * More transitions than allowed in a short time, where the map has no edge of a panel: chatter, a hold.
+    * A sensor that goes off while the wheels stand, where the map has no edge: a pause until it is on again, for at
+      most ``pause_limit_s``; then the edge rule decides, and the robot drives slowly.
 
-    Standing at an edge of a panel a sensor may chatter as it likes: vibration does that. ``is_explained``: whether the
-    map, at the newest estimate, has an edge of a panel near a sensor (by its index).
+    Near an edge of a panel, vibration makes a sensor chatter, so that is ignored. ``is_explained``: whether the map, at
+    the newest estimate, has an edge of a panel near the i-th sensor.
     """
 
     def __init__(self, cfg: HealthConfig, is_explained: Callable[[int], bool]) -> None:
@@ -37,11 +37,11 @@ class FlickerMonitor:
 
     @property
     def is_quiet(self) -> bool:
-        """Nothing to look at as long as all sensors are on."""
+        """Whether there is nothing to judge as long as all sensors are on."""
         return self._last == (1, 1, 1, 1) and self.chatter.finding is None and self.flash.finding is None
 
     def step(self, t_s: float, samples: Sequence[EdgeSample], speed_m_s: float) -> None:
-        """Judge a frame."""
+        """Judge a frame; ``speed_m_s``: of the faster wheel."""
         since_s = t_s - self._cfg.chatter_time_s
         for sample in samples:
             state = sample[1:]
@@ -83,9 +83,9 @@ _SOURCES = ("imu", "enc", "edge")
 
 
 class RateMonitor:
-    """Samples per time of each sensor against what is needed, and against what was usual at the start.
+    """Compares the sample rate of each sensor with the required rate and with the rate of the first period.
 
-    ``finding``: the sensor that lacks most. One without any samples is not slow: others report that.
+    ``finding``: about the worst sensor. A sensor without any samples is left out, because other rules report it.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
@@ -99,7 +99,7 @@ class RateMonitor:
         self._before_hz: list[float] = []
 
     def step(self, t_s: float, imu: int, encoders: int, edges: int) -> None:
-        """Take a frame's numbers of samples; judged once per ``rate_time_s``."""
+        """Take the numbers of samples of a frame; judged once per ``rate_time_s``."""
         elapsed_s, self._last_s = t_s - self._last_s, t_s
         if self._begin_s is None:
             self._begin_s = t_s
@@ -124,7 +124,7 @@ class RateMonitor:
         self.finding = self._too_slow(span_s, before, rates) or self._fewer_than_usual(self._usual_hz, rates)
 
     def _too_slow(self, span_s: float, before: list[float], rates: list[float]) -> MonitorFinding | None:
-        """Judged over two spans, so that a sensor that was silent for a while is none that is slow."""
+        """Judge the better of two periods, so that a sensor that was silent for a while does not count as slow."""
         slowest, found = 1.0, None
         for name, one_hz, other_hz in zip(_SOURCES, before, rates, strict=True):
             sensor, least_hz, hold_hz = SAMPLE_RATES[name]
@@ -145,7 +145,7 @@ class RateMonitor:
 
 
 class LatencyMonitor:
-    """How long a drive takes until its echo comes back: slower, so that the way to a stop stays what it was."""
+    """Latency from a drive to its echo. Above a limit the robot slows down, so that its stopping distance stays."""
 
     def __init__(self, cfg: HealthConfig) -> None:
         self._cfg = cfg
@@ -153,7 +153,7 @@ class LatencyMonitor:
         self._sent: deque[tuple[int, float]] = deque(maxlen=64)
 
     def sent(self, number: int, t_s: float) -> None:
-        """The drive ``number`` had been sent by ``t_s``."""
+        """Drive ``number`` was sent by ``t_s``."""
         self._sent.append((number, t_s))
 
     def step(self, t_s: float, echoed: int) -> None:
@@ -162,7 +162,7 @@ class LatencyMonitor:
         while len(sent) > 1 and sent[1][0] <= echoed:
             sent.popleft()
         if len(sent) > 1 and echoed > 0:
-            # The second one is not in force yet.
+            # The second drive is not in force yet.
             latency_s, cfg = t_s - sent[1][1], self._cfg
             if latency_s > cfg.latency_pause_s:
                 self.alarm.see(t_s, conditions.DRIVES_TOO_LATE.found("latency", latency_s, cfg.latency_pause_s))
@@ -171,13 +171,11 @@ class LatencyMonitor:
 
 
 class SeamMonitor:
-    """Counts the seams that each sensor (places in the robot frame) crossed without going off.
+    """Counts the seams that each edge sensor crossed without going off: every seam is a proof test.
 
-    Every seam is a proof test.
-
-    A sensor is on a panel for certain where the map has it further inside than the estimate may be wrong. When it is
-    for certain on another panel than before, it has crossed a seam; if it has not been off in between, it has missed
-    it. Any off sample proves the sensor sound. A pose that jumps (a fix) is no motion, and begins again.
+    A sensor is certainly on a panel if the map shows it further inside than the error of the estimate. If it is then on
+    another panel than before and was not off in between, it has missed the seam. Any off sample proves that the sensor
+    works. A pose that jumps (a fix) is no motion: the panels are determined again.
     """
 
     def __init__(self, cfg: HealthConfig, mirror: Mirror, robot: RobotConfig, sigmas: float) -> None:
@@ -189,19 +187,19 @@ class SeamMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Where the sensors are is not known; what they have missed is."""
+        """Drop the places of the sensors; keep the numbers of missed seams."""
         self._panels: list[PanelId | None] = [None, None, None, None]
         self._seen = [False, False, False, False]
         self._pose: tuple[float, float, float, float] | None = None
-        self._inside_m = 0.0  # at least so far inside the edges of their panels are all sensors; 0: look again
+        self._inside_m = 0.0  # lower bound of the distance of all sensors from their panels' edges; 0: look up again
 
     def went_off(self, sensor: int) -> None:
-        """A sensor has gone off, or is off: it is not blind."""
+        """Report that a sensor went off or is off: it is not blind."""
         self._seen[sensor] = True
         self.missed[sensor] = 0
 
     def step(self, t_s: float, pose: tuple[float, float, float], sigma_m: float) -> None:
-        """Take a new estimate: its time, (x, y, heading) on the deck, standard deviation of the place."""
+        """Take a new estimate: its time, (x, y, heading) in the deck frame, standard deviation of the position."""
         x, y, heading = pose
         self._blind.settle(t_s)
         before, self._pose = self._pose, (t_s, x, y, heading)
@@ -211,7 +209,7 @@ class SeamMonitor:
             moved_m = hypot(x - before[1], y - before[2])
             if moved_m > reach_m:
                 self._panels = [None, None, None, None]
-            # Twice what they can have moved: the axes of the robot in the deck plane change with the slope, too.
+            # Twice the largest motion, because the robot's axes in the deck plane also change with the slope.
             self._inside_m -= 2.0 * (moved_m + self._reach_m * abs(heading - before[3]))
             if margin_m < self._inside_m and moved_m <= reach_m:
                 return
@@ -241,12 +239,12 @@ class SeamMonitor:
         self.missed[i] = missed = self.missed[i] + 1
         limit = self._cfg.seams_failed
         if missed >= limit and self._pose is not None:
-            # The pose may be wrong instead: the hold brings a fix, and one more seam shows which.
+            # The pose may be wrong instead. The hold brings a fix, and the next seam shows which of them is wrong.
             self._blind.see(self._pose[0], conditions.EDGE_SENSOR_BLIND.found(_CORNERS[i], missed, limit))
 
     @property
     def finding(self) -> MonitorFinding | None:
-        """What is thought of the sensor that has missed most seams in a row, if enough."""
+        """The finding about the sensor that missed most seams in a row, if these are enough."""
         if self._blind.finding is not None:
             return self._blind.finding
         most, limit = max(self.missed), self._cfg.seams_suspect
@@ -256,9 +254,9 @@ class SeamMonitor:
         return conditions.SEAM_MISSED.found(corner, most, limit)
 
 
-# A fan command is in force two delays of the link after it was sent, at the latest.
+# A fan command is in force at the latest two link delays after it was sent.
 _FIRST_COMMAND_S = 1.0
-# The way home goes along rows and columns of panels.
+# Length of the way home over the straight distance, because it follows rows and columns of panels.
 _DETOUR = 1.6
 REPORTED = {
     "imu": conditions.IMU_REPORTED,
@@ -271,10 +269,10 @@ FANS, _SIDES = ("fan_left", "fan_right"), ("left", "right")
 
 
 class FanMonitor:
-    """The echo of the fans' duties against the commanded ``duty`` (left, right), where the robot hangs on them.
+    """Compares the echo of the fans' duties with the commanded ``duty`` (left, right), where the mirror overhangs.
 
-    The echo is a set point. Thrust and rotation are on no wire: a fan that fails without its controller's notice is
-    for the robot to report (``fan_left``, ``fan_right``).
+    The echo is only a set point. Thrust and rotation are not on the link, so the robot itself has to report a fan that
+    fails (``fan_left``, ``fan_right``).
     """
 
     def __init__(self, cfg: HealthConfig, duty: tuple[float, float], overhang: bool) -> None:
@@ -285,7 +283,7 @@ class FanMonitor:
         self._low, self._weak = Since(), Since()
         self._first_s: float | None = None
         self._was_right = False
-        self._sound: tuple[float, float] | None = None  # the newest duties, if nothing is wrong with them
+        self._sound: tuple[float, float] | None = None  # the newest duties, if they are high enough
 
     def step(self, t_s: float, fans: tuple[float, float], faults: Sequence[str]) -> None:
         """Judge a frame."""
@@ -316,7 +314,7 @@ class FanMonitor:
 
 
 class BatteryMonitor:
-    """Whether the charge is enough for the way home. A finding stays: a battery does not charge on the way."""
+    """Checks that the charge is enough for the way home. A finding stays, because the battery does not recharge."""
 
     def __init__(self, cfg: HealthConfig) -> None:
         self._cfg = cfg
@@ -324,7 +322,7 @@ class BatteryMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """The clock was reset."""
+        """Begin the durations again, because the robot's clock has restarted."""
         self._low, self._reported = Since(), Since()
 
     def step(self, t_s: float, soc: float, is_reported: bool, home_m: float) -> None:

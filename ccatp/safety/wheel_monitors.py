@@ -1,4 +1,4 @@
-"""Wheels and encoders against the commanded set points, the gyroscope, and a body that slides."""
+"""Monitors of wheels and encoders against the set points and the gyroscope, and of the wheels' grip."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -10,28 +10,28 @@ from ccatp.control.wheel_motion import MotionSum, SlidingWindow, WheelMeans
 from ccatp.core import GravitySample, ImuSample, SlideRule, WheelSample
 from ccatp.safety.escalation import FindingLatch, Since
 
-# A servo of 0.1 s and a link of 40 ms have forgotten a command after this long, to within 2 %.
+# After this time a command has less than 2 % effect on a wheel (servo 0.1 s, link 40 ms).
 _MEMORY_S = 0.4
-# What is commanded is known in steps of five frames, and reaches the wheels two delays of the link later.
+# The set points are known in steps of five frames, and reach the wheels two link delays later.
 _LATENCY_S = 0.1
 LATE_S = 0.1
-"""A drive that has been in force for longer was followed by others that have not arrived: the link stalls."""
-# Wheels and gyroscope that differ by more than this within a stall's time do not show the same motion.
+"""If a drive has been in force for longer, later drives have not arrived: the link stalls."""
+# A larger difference between wheels and gyroscope within ``stall_time_s`` means that they show different motions.
 _SAME_TURN_RAD = 0.05
-# A few samples of an encoder that counts steps are hardly a speed: with fewer than usual a wheel has to be
-# faster than it may be by so many times, or for longer, and to differ so many times more from the gyroscope.
+# With fewer encoder samples than usual a speed is inaccurate: the limits are multiplied by this factor, or a longer
+# period is judged.
 _VAGUE = 2.5
-# A wheel that goes on creeping for this long while it is held will not stop by itself.
+# A held wheel that creeps for longer than this does not stop by itself.
 _CREEP_FAULT_S = 1.0
 _SIDES = ("right", "left")
-# No wheel changes its rate by this much within a frame; two counts in a sample of 1 ms are 10 rad/s.
+# No wheel changes its rate by more within a frame; two counts in a sample of 1 ms are 10 rad/s.
 _WILD_RAD_S = 12.0
 _FEW_SAMPLES = 5
-_STILL_M_S = 0.0005  # slower than this nothing creeps; noise of rate encoders over a stall's time is a tenth of it
+_STILL_M_S = 0.0005  # below this a wheel does not creep; encoder noise over ``stall_time_s`` is a tenth of it
 
 
 class Span(NamedTuple):
-    """Lowest and highest set points over some drives, m/s at the wheels' rims."""
+    """Lowest and highest set points over several drives, m/s at the wheels' rims."""
 
     t_s: float
     right_low: float
@@ -40,15 +40,15 @@ class Span(NamedTuple):
     left_high: float
 
     def of(self, side: int) -> tuple[float, float]:
-        """Those of one wheel, by its place in ``_SIDES``."""
+        """Lowest and highest of one wheel, by its index in ``_SIDES``."""
         return self[1 + 2 * side], self[2 + 2 * side]
 
 
 class WheelMonitor:
-    """Runaway, stall, dead and frozen encoders, wheels that creep; gyroscope and wheels that turn differently.
+    """Finds runaway and stalled wheels, dead and frozen encoders, creeping wheels, and turns that disagree.
 
-    The rules use the lowest and highest set points of a while, so they need no model of the servo: a wheel that was
-    commanded to go fast all the while and stands, or that is faster than any set point.
+    The rules compare with the lowest and highest set points of a period, so they need no model of the servo: a wheel
+    stalls if it stands although all set points were high, and runs away if it is faster than every set point.
     """
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
@@ -56,7 +56,7 @@ class WheelMonitor:
         self.alarm, self.yaw = FindingLatch(cfg.retry_after_s), FindingLatch(cfg.retry_after_s)
         self._shortly, self._stalling = SlidingWindow(cfg.runaway_time_s), SlidingWindow(cfg.stall_time_s)
         self._turning = SlidingWindow(cfg.yaw_time_s)
-        self.speed_m_s = 0.0  # of the faster wheel, lately
+        self.speed_m_s = 0.0  # of the faster wheel, over ``runaway_time_s``
         self.spans: deque[Span] = deque(maxlen=64)
         self._lately: Span | None = None
         self._stall: Span | None = None
@@ -74,12 +74,12 @@ class WheelMonitor:
         self.spans.append(Span(t_s, r * a, r * b, r * c, r * d))
 
     def learn(self, t_s: float) -> None:
-        """Look at the commands again: at ``t_s`` a new span has been taken, or should have been."""
+        """Update the recent set points at ``t_s``, when a new span was taken or was due."""
         self._lately = self._commanded_over(t_s, _MEMORY_S)
         self._stall = self._commanded_over(t_s, self._cfg.stall_time_s + _LATENCY_S)
 
     def _commanded_over(self, t_s: float, memory_s: float) -> Span | None:
-        """The span of all drives of the last ``memory_s``; ``None`` if they are not all known."""
+        """The span of all drives of the last ``memory_s``; ``None`` unless all are known."""
         spans, since_s = self.spans, t_s - memory_s
         if not spans or spans[0][0] > since_s or t_s - spans[-1][0] > _LATENCY_S:
             return None
@@ -103,8 +103,8 @@ class WheelMonitor:
     ) -> None:
         """Judge a frame by the running sums at its end.
 
-        Since the last look, ``is_free``: the robot executed its commands, and was permitted to go anywhere;
-        ``is_late``: it executed an old command; ``is_sparse``: the encoders gave fewer samples than usual.
+        Since the last call, ``is_free``: the robot executed its commands, and all motion was permitted; ``is_held``: it
+        held its wheels; ``is_late``: it executed an old command; ``is_sparse``: fewer encoder samples than usual.
         """
         t_s = now[0]
         shortly, stalling, turning = self._shortly.push(now), self._stalling.push(now), self._turning.push(now)
@@ -138,7 +138,7 @@ class WheelMonitor:
         lately = self._lately
         if lately is not None and t_s - lately.t_s <= _LATENCY_S:
             return lately
-        # Main may have commanded anything since. Where the robot holds its wheels, whatever it was has been forgotten.
+        # The commands since then are not known. If the robot has held its wheels for long enough, none has effect.
         is_held = self._held_since_s is not None and t_s - self._held_since_s >= _MEMORY_S
         return Span(t_s, 0.0, 0.0, 0.0, 0.0) if is_held else None
 
@@ -186,7 +186,7 @@ class WheelMonitor:
         return low >= limit or high <= -limit
 
     def _find_creep(self, now: MotionSum, moved: MotionSum, commanded: Span, samples: Sequence[WheelSample]) -> None:
-        """Motion against a set point of zero. While the link stalls the robot keeps its last command, then stops."""
+        """Find motion at a set point of zero, except while a robot behind a stalled link executes its last command."""
         runs_down_s = _MEMORY_S + self._cfg.stall_time_s
         is_running_down = self._late_s is not None and now[0] - self._late_s < runs_down_s
         if is_running_down or commanded[1:] != (0.0, 0.0, 0.0, 0.0):
@@ -207,7 +207,7 @@ class WheelMonitor:
                 continue
             limit_m_s, wheel = cfg.stop_speed_m_s, f"{side}_wheel"
             if broken:
-                self._stood = now  # what it says it went, it did not
+                self._stood = now  # a broken encoder's travel does not count
                 finding = self._broken(side, speed_m_s, limit_m_s, broken)
             elif creeps:
                 condition = conditions.WHEEL_CREEPS_ON if lasts_s >= _CREEP_FAULT_S else conditions.WHEEL_CREEPS
@@ -217,7 +217,7 @@ class WheelMonitor:
             self.alarm.see(t_s, finding)
 
     def _compare_turns(self, t_s: float, moved: MotionSum, vagueness: float) -> None:
-        """The turn of the gyroscope, while it was believed, with that of the wheels; ``vagueness`` widens the limit."""
+        """Compare the turns of gyroscope, while plausible, and wheels; ``vagueness`` multiplies the limit."""
         cfg, (_, right_m, left_m, by_gyroscope) = self._cfg, moved
         by_wheels = (right_m - left_m) / self._base_m
         difference = by_gyroscope - by_wheels
@@ -226,16 +226,16 @@ class WheelMonitor:
             self.yaw.see(t_s, conditions.YAW_DISAGREES.found("imu_wz", difference, limit))
 
 
-_GRAVITY_TIME_S = 0.2  # over which its readings, noisy ones, are averaged
-_STILL_RAD_S = 0.05  # a wheel that is held gives way so slowly on a slope
-_HOLDS = 1.05  # full thrust over the least: with less it may slide anywhere
+_GRAVITY_TIME_S = 0.2  # time constant of the average of the noisy gravity samples
+_STILL_RAD_S = 0.05  # on a slope a held wheel turns more slowly than this
+_HOLDS = 1.05  # full thrust over the least; below this the robot may slide anywhere
 
 
 class GripMonitor:
-    """Loss of grip: the body goes downhill faster than its wheels. And too little of it, by the creep of turns.
+    """Finds loss of grip (the body moves downhill faster than its wheels) and too little grip (by the creep of turns).
 
-    Its acceleration ahead, less the bias at rest, against the change of the wheels' speed, and the gyroscope's rate
-    against their turn; or the robot says so itself. ``finding``: of the margin that main measures, or None.
+    Loss of grip: the forward acceleration less its bias at rest is compared with the change of the wheels' speed, and
+    the gyroscope with the wheels' turn; or the robot reports it. ``finding``: about the margin that main measures.
     """
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
@@ -248,7 +248,7 @@ class GripMonitor:
         self._rested = 0
 
     def take_margin(self, margin: float) -> None:
-        """Full thrust over the least that holds the robot everywhere; 0: not measured."""
+        """Take main's margin: full thrust over the least that holds the robot everywhere; 0: not measured."""
         is_short, is_held = 0.0 < margin < 0.999 * self._least_margin, margin >= _HOLDS
         condition = conditions.GRIP_LITTLE if is_held else conditions.GRIP_TOO_LITTLE
         least = self._least_margin if is_held else _HOLDS
@@ -263,7 +263,7 @@ class GripMonitor:
         gravity: GravitySample | None,
         bias_rad_s: float,
     ) -> bool:
-        """Take a frame; whether the robot slides. ``bias_rad_s``: of the gyroscope."""
+        """Take a frame; returns whether the robot slides. ``bias_rad_s``: of the gyroscope."""
         rule = self._rule
         if gravity is not None:
             self._ahead += 0.05 / (_GRAVITY_TIME_S + 0.05) * (gravity[1] - self._ahead)
@@ -282,20 +282,20 @@ class GripMonitor:
         if not is_sound or self._rested < rule.BIAS_SAMPLES or not 0.0 < dt_s < rule.MEMORY_S:
             rule.reset()
             return False
-        # Of the acceleration the link has the part ahead alone.
+        # The link carries only the forward component of the acceleration.
         side = 1.0 if self._ahead >= rule.LEAST_SLOPE else -1.0 if self._ahead <= -rule.LEAST_SLOPE else 0.0
         turned_rad = (wz - bias_rad_s - self._per_base * (right - left)) * dt_s
         slid_m_s = rule.step(dt_s, (ax - self._bias_m_s2) * dt_s - change_m_s, 0.0, turned_rad, (side, 0.0))
         return slid_m_s > 0.0 and self.report(t_s, slid_m_s)
 
     def report(self, t_s: float, slid_m_s: float) -> bool:
-        """It slides downhill so fast, by this rule or by the robot's own."""
+        """Report that the robot slides downhill at ``slid_m_s``, by this rule or by the robot's own."""
         self.alarm.see(t_s, conditions.GRIP_LOST.found("grip", slid_m_s, self._rule.slip_m_s))
         return True
 
 
 def _what_is_broken(samples: Sequence[WheelSample], side: int) -> str:
-    """What shows that it is the encoder and not the wheel, or nothing."""
+    """What is wrong with an encoder, or an empty text if its samples are plausible."""
     rates = [rate for sample in samples if (rate := sample[1 + side]) is not None]
     if len(rates) < _FEW_SAMPLES:
         return ""

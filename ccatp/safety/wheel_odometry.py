@@ -1,4 +1,4 @@
-"""Wheel odometry between any two times, from encoder samples that come in frames."""
+"""Wheel odometry between any two times, from the encoder samples of the frames."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from ccatp.core import WheelSample
 # A frame may be as short as an encoder period.
 HISTORY_FRAMES = 256
 KNOTS_KEPT = 512
-LARGEST = 1e9  # rad/s: finite, at least
+LARGEST = 1e9  # rad/s; a check for finite values
 
 
 class Knot(NamedTuple):
@@ -24,9 +24,9 @@ class Knot(NamedTuple):
 class WheelTrack:
     """The velocity of the robot over the last frames.
 
-    ``v = r (wr + wl) / 2``, ``omega = r (wr - wl) / L`` (inverse of thesis eq. 3.3), linear between samples. ``push``
-    is all that a frame costs as long as no motion is asked for; samples are read, as far back as ``reach_s``, when
-    ``update`` is called. A rate above ``limit_rad_s``, or not a number, is no sample.
+    ``v = r (wr + wl) / 2``, ``omega = r (wr - wl) / L`` (inverse of thesis eq. 3.3), linear between samples. To keep
+    the cost of a frame low, ``push`` only stores the samples; ``update`` reads those of the last ``reach_s``. A rate
+    that is not a number or exceeds ``limit_rad_s`` is ignored.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class WheelTrack:
         frames = self._frames
         frames.append(samples)
         t_s, right, left = samples[-1]
-        if frames[0][-1][0] < t_s - self._reach_s:  # never read; what is kept for long costs a cache miss in the end
+        if frames[0][-1][0] < t_s - self._reach_s:  # too old to be read; dropped early to avoid cache misses
             frames.popleft()
         limit = self._limit_rad_s
         if right is None or left is None or not (-limit <= right <= limit and -limit <= left <= limit):
@@ -58,7 +58,7 @@ class WheelTrack:
         self._usable_t_s = max(self._usable_t_s, t_s)
 
     def update(self, t_s: float) -> None:
-        """Read the frames pushed since the last call; samples that go back in time or are not finite are dropped."""
+        """Read the frames pushed since the last call. Samples that are not newer or not finite are dropped."""
         frames, since_s = self._frames, t_s - self._reach_s
         while frames:
             samples = frames.popleft()
@@ -83,7 +83,7 @@ class WheelTrack:
                 self.knots.append(Knot(t_s, half_radius_m * both, radius_per_base * turning))
 
     def silence_s(self, t_s: float) -> float:
-        """How long a wheel is without a usable sample, s; 0 while the last one is held, since the boot without any."""
+        """Time without a usable sample of a wheel, s; 0 up to ``hold_s``. Without any sample: time since the boot."""
         if self._usable_t_s == -inf:
             return max(t_s, self._hold_s)
         silent_s = t_s - self._usable_t_s
@@ -91,12 +91,12 @@ class WheelTrack:
 
 
 class Odometry:
-    """A pose carried along by wheel travel in a flat frame."""
+    """A pose in a plane, advanced by the travel of the wheels."""
 
     __slots__ = ("_next", "_track", "heading_rad", "omega_rad_s", "t_s", "v_m_s", "x_m", "y_m")
 
     def __init__(self, track: WheelTrack, t_s: float, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
-        """Start at ``pose`` = (x, y, heading) at ``t_s``; velocity by the track (call its ``update`` before)."""
+        """Start at ``pose`` = (x, y, heading) at ``t_s``. Call ``track.update`` before."""
         self.t_s = t_s
         self.x_m, self.y_m, self.heading_rad = pose
         self._track = track
@@ -109,7 +109,7 @@ class Odometry:
         self.v_m_s, self.omega_rad_s = self._velocity_at(t_s, before, following)
 
     def _velocity_at(self, t_s: float, before: Knot, following: int) -> tuple[float, float]:
-        """Velocity between ``before`` and the following knot; that of ``before`` where there is none."""
+        """Velocity between ``before`` and the following knot; that of ``before`` if there is no following one."""
         knots = self._track.knots
         if following >= len(knots):
             return before.v_m_s, before.omega_rad_s
@@ -121,7 +121,7 @@ class Odometry:
         return v, before.omega_rad_s + share * (after.omega_rad_s - before.omega_rad_s)
 
     def advance_to(self, t_s: float) -> None:
-        """Carry the pose to ``t_s``, trapezoid by trapezoid; a time before the pose's is ignored."""
+        """Advance the pose to ``t_s`` by the trapezoidal rule; an earlier time has no effect."""
         knots, dropped = self._track.knots, self._track.dropped
         following, count = max(self._next - dropped, 0), len(knots)
         while following < count:
@@ -151,7 +151,7 @@ class Odometry:
 def pose_at(
     track: WheelTrack, t_s: float, known_t_s: float, pose: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """The pose (x, y, heading) at ``t_s`` from that at ``known_t_s``, forwards or backwards along the wheel track."""
+    """The pose (x, y, heading) at ``t_s`` from ``pose`` at ``known_t_s``, forward or backward along the track."""
     if t_s >= known_t_s:
         forward = Odometry(track, known_t_s, pose)
         forward.advance_to(t_s)
