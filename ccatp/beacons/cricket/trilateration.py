@@ -1,6 +1,6 @@
 """Phase 1 of self-mapping: a first map by trilateration after a plan, and its drawn errors."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from ccatp.beacons.cricket.map_fit import robust_loss
 from ccatp.beacons.cricket.mote_plan import MotePlan
-from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, list_names
+from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, RigidBody, list_names
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import RigidMotion
 
@@ -56,151 +56,6 @@ def trilaterate(
     return points, costs
 
 
-class DegenerateStep(MappingError):
-    """A step of phase 1 whose geometry does not determine a mote well enough."""
-
-
-class TrilaterationStep(NamedTuple):
-    """How one mote was placed."""
-
-    mote: int
-    references: tuple[int, ...]
-    dop: float
-    how: str  # ``axes``, ``cosines`` or ``trilateration``
-
-
-class Sketch:
-    """Places found so far, and the steps that found them.
-
-    The errors of the places are drawn: the same steps made again on ranges with errors (``draw_errors``).
-    """
-
-    def __init__(self, network: RangeNetwork, max_dop: float) -> None:
-        self.means = PairMeans(network)
-        self._names, self._dimension, self._max_dop = network.names, network.dimension, max_dop
-        self.positions_m = np.full((network.count, network.dimension), np.nan)
-        self._seen_m = self.positions_m.copy()  # places from which the dilution of precision is judged
-        self.steps: list[TrilaterationStep] = []
-
-    def judge_from(self, motes: Sequence[int], places_m: FloatArray) -> None:
-        """Judge later steps from better places than those found, shape (k, d).
-
-        The error of a place from a small stand is far larger than that of a range: on a stand whose motes came out
-        wider apart than they are, the next ones look better determined than they are.
-        """
-        self._seen_m[list(motes)] = places_m
-
-    def set_axes(self, origin: int, axis: int) -> None:
-        """Origin and second axis: A (0, 0), B (0, d_AB); in the plane alone. Raises MappingError: A and B have none."""
-        motes, places_m = [origin, axis], np.array([[0.0, 0.0], [0.0, self._ranges(axis, [origin])[0][0]]])
-        self.positions_m[motes] = self._seen_m[motes] = places_m
-        self.steps += [TrilaterationStep(mote, (), 0.0, "axes") for mote in motes]
-
-    def add_by_cosines(self, mote: int, origin: int, axis: int) -> None:
-        """A mote on the right of the axis from A to B, by the law of cosines.
-
-        Raises MappingError: a range to A or B is missing. Raises DegenerateStep: the mote is on the axis, or nearly.
-        """
-        (a, b), c = self._ranges(mote, [origin, axis])[0], self.positions_m[axis, 1]
-        place = _by_cosines(a, b, c)
-        if not place[0] > 0.0:
-            raise DegenerateStep(
-                f"{self._names[mote]}: ranges of {a:.3f} and {b:.3f} m to {self._names[origin]} and "
-                f"{self._names[axis]}, {c:.3f} m apart, meet on their line or not at all; move the anchors off it"
-            )
-        self._add(mote, (origin, axis), place, "cosines")
-
-    def add_by_ranges(self, mote: int, references: Sequence[int]) -> None:
-        """A mote by trilateration from motes that have places.
-
-        Raises MappingError: a range to a reference is missing. Raises DegenerateStep: the references lie on a line with
-        the mote, or nearly, or its mirror image across them fits as well.
-        """
-        ranges, sigmas = self._ranges(mote, references)
-        anchors = self.positions_m[list(references)]
-        found, costs = trilaterate(sphere_crossings(anchors, ranges), anchors, ranges, sigmas)
-        apart_m = float(np.linalg.norm(found[1] - found[0]))
-        if apart_m > _APART * float(sigmas.max()) and abs(costs[1] - costs[0]) < _ALIKE:
-            raise DegenerateStep(
-                f"{self._names[mote]} from {self._listed(references)}: the mirror image across them, "
-                f"{apart_m:.3g} m away, fits as well; spread the motes it is measured from"
-            )
-        self._add(mote, references, found[np.argmin(costs)], "trilateration")
-
-    def _add(self, mote: int, references: Sequence[int], place: FloatArray, how: str) -> None:
-        lines = place - self._seen_m[list(references)]
-        singular = np.linalg.svd(lines / np.linalg.norm(lines, axis=1)[:, None], compute_uv=False)
-        dop = float(np.sqrt((singular**-2.0).sum())) if singular[-1] > 0.0 else float("inf")
-        if not dop <= self._max_dop:
-            raise DegenerateStep(
-                f"{self._names[mote]} from {self._listed(references)}: dilution of precision {dop:.4g} exceeds "
-                f"{self._max_dop:.4g}; spread the motes it is measured from"
-            )
-        self.positions_m[mote] = self._seen_m[mote] = place
-        self.steps.append(TrilaterationStep(mote, tuple(references), dop, how))
-
-    def _ranges(self, mote: int, references: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        ranges, sigmas = self.means.table_m[mote, list(references)], self.means.sigma_table_m[mote, list(references)]
-        if (missing := np.flatnonzero(np.isnan(ranges))).size:
-            raise MappingError(
-                f"no range between {self._names[references[missing[0]]]} and {self._names[mote]}: phase 1 cannot place "
-                f"{self._names[mote]}; move it into reach"
-            )
-        return ranges, sigmas
-
-    def _listed(self, motes: Sequence[int]) -> str:
-        return list_names([self._names[mote] for mote in motes])
-
-    def draw_errors(self, places_m: FloatArray, draws: int, maps: int = _NEAR) -> tuple[FloatArray, FloatArray]:
-        """Mean (n, d) and covariance (n d, n d) of the errors, by the parametric bootstrap (Efron 1979).
-
-        At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps
-        made of them. Derivatives would not do: from a small stand errors grow to decimetres, and along so wide an arc
-        no line is a tangent everywhere. What a line takes to be known within a millimetre is known within centimetres.
-        For the same reason the errors at those places are not those at the true ones: they are drawn again at a few of
-        the ``maps`` that were drawn (iterated bootstrap: Hall 1986; 0: at the places alone). These are turned one way
-        and the other, so across the arcs the covariance is wider than that of the errors there are (NEES 0.8); phase 2
-        is less sure than the errors at the places alone would make it (docs/cricket.md). ``places_m``: where the motes
-        might be, shape (n, d). Zeros without draws.
-        """
-        count, d = places_m.shape
-        if draws == 0:
-            return np.zeros_like(places_m), np.zeros((count * d, count * d))
-        rng = np.random.default_rng(0)  # the same draws for every map: the same ranges give the same one
-        near = self._drawn(places_m, maps, rng) if maps else places_m[None]
-        errors = np.concatenate([self._drawn(places, draws // len(near), rng) - places for places in near])
-        errors = errors.reshape(len(errors), -1)
-        return errors.mean(axis=0).reshape(count, d), np.atleast_2d(np.cov(errors.T))
-
-    def _drawn(self, places_m: FloatArray, draws: int, rng: np.random.Generator) -> FloatArray:
-        """Maps by the same steps from ranges with errors between some places (n, d), shape (draws, n, d)."""
-        count, d = places_m.shape
-        first, second = self.means.pairs.T
-        true_m = np.linalg.norm(places_m[first] - places_m[second], axis=1)
-        errors_of = rng.normal(0.0, 1.0, (len(true_m), draws))
-        lengths = np.full((count, count, draws), np.nan)
-        lengths[first, second] = true_m[:, None] + self.means.sigmas_m[:, None] * errors_of
-        lengths[second, first] = lengths[first, second]
-        drawn = np.broadcast_to(places_m, (draws, count, d)).copy()
-        origin, axis = (step.mote for step in self.steps if step.how == "axes")
-        drawn[:, axis, 1] = lengths[origin, axis]
-        for step in self.steps:
-            references, own = list(step.references), lengths[list(step.references), step.mote].T
-            if step.how == "cosines":
-                drawn[:, step.mote] = _by_cosines(own[:, 0], own[:, 1], drawn[:, references[1], 1])
-            elif step.how == "trilateration":
-                starts = np.broadcast_to(places_m[step.mote], (draws, d))
-                sigmas = self.means.sigma_table_m[step.mote, references]
-                drawn[:, step.mote] = trilaterate(starts, drawn[:, references], own, sigmas, steps=_DRAWN_STEPS)[0]
-        return drawn
-
-
-def _by_cosines(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    # y = (d_A^2 + d_AB^2 - d_B^2) / (2 d_AB), x = sqrt(d_A^2 - y^2); x is nought where the circles do not meet.
-    y = (a * a + c * c - b * b) / (2.0 * c)
-    return np.stack([np.sqrt(np.maximum(a * a - y * y, 0.0)), y], axis=-1)
-
-
 def sphere_crossings(anchors_m: FloatArray, ranges_m: FloatArray) -> FloatArray:
     """Both crossings of the spheres about anchors, on either side of the plane through them, shape (2, ..., d).
 
@@ -219,37 +74,141 @@ def sphere_crossings(anchors_m: FloatArray, ranges_m: FloatArray) -> FloatArray:
     return np.stack([foot + height * normal, foot - height * normal])
 
 
+class DegenerateStep(MappingError):
+    """A step of phase 1 whose geometry does not determine a mote well enough."""
+
+
 class FirstMap(NamedTuple):
     """What phase 1 gives."""
 
     positions_m: FloatArray  # shape (n, d)
     covariance_m2: FloatArray  # of all coordinates, zero without draws, shape (n d, n d)
     bias_m: FloatArray  # mean error of the places, as far as it is known, shape (n, d)
-    steps: tuple[TrilaterationStep, ...] = ()
     doubtful: tuple[int, ...] = ()  # motes whose mirror image fits almost as well
 
 
 def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: int = 0, maps: int = _NEAR) -> FirstMap:
     """Phase 1 of Patil et al., figure 8, in the field's frame.
 
-    A is the origin, B on the second axis, the first stand follows by the law of cosines, every other one by
-    trilateration from all motes of the stand before it. ``draws``, ``maps``: as of ``Sketch.draw_errors``. Raises
-    MappingError: a step that cannot be made; the message names its motes.
+    A is the origin, B on the second axis, the first stand follows by the law of cosines, on the right of the axis from
+    A to B, every other one by trilateration from all motes of the stand before it. ``draws``, ``maps``: as of
+    ``_drawn_errors``. Raises MappingError: a range that a step needs is missing. Raises DegenerateStep: a mote is on
+    the axis, those that it is placed from lie on a line with it, or nearly, or its mirror image fits as well.
     """
-    sketch = Sketch(network, max_dop)
-    origin, axis = plan.anchors
-    sketch.set_axes(origin, axis)
-    for mote in plan.bodies[0].motes:
-        sketch.add_by_cosines(mote, origin, axis)
-    for before, after in pairwise(plan.bodies):
-        sketch.judge_from(before.motes, before.placed(sketch.positions_m))
-        for mote in after.motes:
-            sketch.add_by_ranges(mote, before.motes)
-    shaped = sketch.positions_m.copy()  # with the stands as they are known to be
+    means = PairMeans(network)
+    found_m = _laid_out(plan, means, max_dop)
+    shaped_m = found_m.copy()  # with the stands as they are known to be
     for stand in plan.bodies:
-        shaped[list(stand.motes)] = stand.placed(sketch.positions_m)
-    bias, covariance = sketch.draw_errors(shaped, draws, maps)
+        shaped_m[list(stand.motes)] = stand.placed(found_m)
+    bias_m, covariance_m2 = _drawn_errors(plan, means, shaped_m, draws, maps)
     up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
     motion = RigidMotion(np.column_stack([(up[1], -up[0]), up]), plan.axes_m[0])
-    positions, covariance = motion.moved(sketch.positions_m), motion.turned_map(covariance)
-    return FirstMap(positions, covariance, bias @ motion.rotation.T, tuple(sketch.steps))
+    return FirstMap(motion.moved(found_m), motion.turned_map(covariance_m2), bias_m @ motion.rotation.T)
+
+
+def _steps(plan: MotePlan) -> Iterator[tuple[int, list[int], RigidBody | None]]:
+    """Each mote but A and B, with those that it is placed from: these two, or the stand before its own."""
+    yield from ((mote, list(plan.anchors), None) for mote in plan.bodies[0].motes)
+    for before, after in pairwise(plan.bodies):
+        yield from ((mote, list(before.motes), before) for mote in after.motes)
+
+
+def _laid_out(plan: MotePlan, means: PairMeans, max_dop: float) -> FloatArray:
+    places_m, (origin, axis) = np.full((len(plan.names), plan.dimension), np.nan), plan.anchors
+    places_m[origin], places_m[axis] = 0.0, (0.0, _ranges(plan, means, axis, [origin])[0][0])
+    for mote, references, stand in _steps(plan):
+        ranges, sigmas = _ranges(plan, means, mote, references)
+        anchors_m, listed = places_m[references], list_names([plan.names[other] for other in references])
+        if stand is None:
+            (a, b), c = ranges, anchors_m[1, 1]
+            places_m[mote] = _by_cosines(a, b, c)
+            if not places_m[mote, 0] > 0.0:
+                raise DegenerateStep(
+                    f"{plan.names[mote]}: ranges of {a:.3f} and {b:.3f} m to {plan.names[origin]} and "
+                    f"{plan.names[axis]}, {c:.3f} m apart, meet on their line or not at all; move the anchors off it"
+                )
+        else:
+            found_m, costs = trilaterate(sphere_crossings(anchors_m, ranges), anchors_m, ranges, sigmas)
+            apart_m = float(np.linalg.norm(found_m[1] - found_m[0]))
+            if apart_m > _APART * float(sigmas.max()) and abs(costs[1] - costs[0]) < _ALIKE:
+                raise DegenerateStep(
+                    f"{plan.names[mote]} from {listed}: the mirror image across them, {apart_m:.3g} m away, fits as "
+                    "well; spread the motes it is measured from"
+                )
+            places_m[mote] = found_m[np.argmin(costs)]
+        # The error of a place from a small stand is far larger than that of a range: from a stand whose motes came out
+        # wider apart than they are, the next ones would look better determined than they are.
+        dop = _dilution(places_m[mote] - (anchors_m if stand is None else stand.placed(places_m)))
+        if not dop <= max_dop:
+            raise DegenerateStep(
+                f"{plan.names[mote]} from {listed}: dilution of precision {dop:.4g} exceeds {max_dop:.4g}; spread the "
+                "motes it is measured from"
+            )
+    return places_m
+
+
+def _dilution(lines: FloatArray) -> float:
+    singular = np.linalg.svd(lines / np.linalg.norm(lines, axis=1)[:, None], compute_uv=False)
+    return float(np.sqrt((singular**-2.0).sum())) if singular[-1] > 0.0 else float("inf")
+
+
+def _ranges(plan: MotePlan, means: PairMeans, mote: int, references: list[int]) -> tuple[FloatArray, FloatArray]:
+    ranges, sigmas = means.table_m[mote, references], means.sigma_table_m[mote, references]
+    if (missing := np.flatnonzero(np.isnan(ranges))).size:
+        name = plan.names[mote]
+        raise MappingError(
+            f"no range between {plan.names[references[missing[0]]]} and {name}: phase 1 cannot place {name}; move it "
+            "into reach"
+        )
+    return ranges, sigmas
+
+
+def _drawn_errors(
+    plan: MotePlan, means: PairMeans, places_m: FloatArray, draws: int, maps: int
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (n, d) and covariance (n d, n d) of the errors, by the parametric bootstrap (Efron 1979).
+
+    At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps
+    made of them. Derivatives would not do: from a small stand errors grow to decimetres, and along so wide an arc
+    no line is a tangent everywhere. What a line takes to be known within a millimetre is known within centimetres.
+    For the same reason the errors at those places are not those at the true ones: they are drawn again at a few of
+    the ``maps`` that were drawn (iterated bootstrap: Hall 1986; 0: at the places alone). These are turned one way
+    and the other, so across the arcs the covariance is wider than that of the errors there are (NEES 0.8); phase 2
+    is less sure than the errors at the places alone would make it (docs/cricket.md). ``places_m``: where the motes
+    might be, shape (n, d). Zeros without draws.
+    """
+    count, d = places_m.shape
+    if draws == 0:
+        return np.zeros_like(places_m), np.zeros((count * d, count * d))
+    rng = np.random.default_rng(0)  # the same draws for every map: the same ranges give the same one
+    near = _drawn(plan, means, places_m, maps, rng) if maps else places_m[None]
+    errors = np.concatenate([_drawn(plan, means, at_m, draws // len(near), rng) - at_m for at_m in near])
+    errors = errors.reshape(len(errors), -1)
+    return errors.mean(axis=0).reshape(count, d), np.atleast_2d(np.cov(errors.T))
+
+
+def _drawn(plan: MotePlan, means: PairMeans, places_m: FloatArray, draws: int, rng: np.random.Generator) -> FloatArray:
+    """Maps by the same steps from ranges with errors between some places (n, d), shape (draws, n, d)."""
+    count, d = places_m.shape
+    first, second = means.pairs.T
+    true_m = np.linalg.norm(places_m[first] - places_m[second], axis=1)
+    errors_of = rng.normal(0.0, 1.0, (len(true_m), draws))
+    lengths = np.full((count, count, draws), np.nan)
+    lengths[first, second] = true_m[:, None] + means.sigmas_m[:, None] * errors_of
+    lengths[second, first] = lengths[first, second]
+    drawn, (origin, axis) = np.broadcast_to(places_m, (draws, count, d)).copy(), plan.anchors
+    drawn[:, axis, 1] = lengths[origin, axis]
+    for mote, references, stand in _steps(plan):
+        own = lengths[references, mote].T
+        if stand is None:
+            drawn[:, mote] = _by_cosines(own[:, 0], own[:, 1], drawn[:, axis, 1])
+        else:
+            starts, sigmas = np.broadcast_to(places_m[mote], (draws, d)), means.sigma_table_m[mote, references]
+            drawn[:, mote] = trilaterate(starts, drawn[:, references], own, sigmas, steps=_DRAWN_STEPS)[0]
+    return drawn
+
+
+def _by_cosines(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    # y = (d_A^2 + d_AB^2 - d_B^2) / (2 d_AB), x = sqrt(d_A^2 - y^2); x is nought where the circles do not meet.
+    y = (a * a + c * c - b * b) / (2.0 * c)
+    return np.stack([np.sqrt(np.maximum(a * a - y * y, 0.0)), y], axis=-1)

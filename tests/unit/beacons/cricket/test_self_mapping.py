@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
-from ccatp.beacons.cricket.mote_plan import network_plan
+from ccatp.beacons.cricket.mote_plan import MotePlan, network_plan
 from ccatp.beacons.cricket.range_network import (
     MappingError,
     MoteRange,
+    RigidBody,
     TdoaError,
     build_network,
     coordinates_of,
     pair_range,
 )
 from ccatp.beacons.cricket.self_mapping import MoteMapper, complete_stands, conditioned, run_phase_two
-from ccatp.beacons.cricket.trilateration import DegenerateStep, FirstMap, Sketch, map_by_plan
+from ccatp.beacons.cricket.trilateration import DegenerateStep, FirstMap, map_by_plan
 from ccatp.config.beacon_models import PhaseTwoConfig
 from ccatp.config.load import load_radio_config
 from ccatp.sim.motes import true_motes
@@ -29,6 +30,7 @@ from tests.unit.beacons.cricket.fields import (
     ZIGZAG,
     FloatArray,
     Pairs,
+    names,
     near_pairs,
     network_of,
 )
@@ -234,24 +236,19 @@ A, B = np.zeros(2), np.array([0.0, 2.0])
 LINE = [[1.0, 0.5], [1.0, 1.0], [1.0, 1.5]]
 
 
-def sketch_of(places: FloatArray, rng: np.random.Generator | None = None, sigma_m: float = SIGMA_M) -> Sketch:
-    return Sketch(network_of(places, near_pairs(places, 1e3), rng, sigma_m=sigma_m), 60.0)
+def first_map_of(places: FloatArray, pairs: Pairs, rng: np.random.Generator | None = None, draws: int = 0) -> FirstMap:
+    """A and B, a stand of three motes or fewer, and one mote that it places."""
+    count, stands = len(places), [tuple(range(2, min(len(places), 5))), *([(5,)] if len(places) > 5 else [])]
+    bodies = tuple(RigidBody(f"N{motes[0]}", motes, places[list(motes)]) for motes in stands)
+    plan = MotePlan(names(count), 2, (0, 1), bodies, np.array([A, B]), (), (), np.full_like(places, np.nan))
+    return map_by_plan(plan, network_of(places, pairs, rng, sigma_m=1e-3), 60.0, draws)
 
 
 def test_joint_errors_of_cosines_and_trilateration() -> None:
     places = np.array([A, B, [1.0, 1.0], [1.4, 1.3], [1.4, 0.7], [4.0, 1.5]])
-    rng = np.random.default_rng(1)
-
-    def laid(noise: np.random.Generator | None) -> Sketch:
-        sketch = sketch_of(places, noise, sigma_m=1e-3)
-        sketch.set_axes(0, 1)
-        for mote in (2, 3, 4):
-            sketch.add_by_cosines(mote, 0, 1)
-        sketch.add_by_ranges(5, (2, 3, 4))
-        return sketch
-
-    sample = np.cov(np.array([laid(rng).positions_m.ravel() for _ in range(300)]).T)
-    bias, covariance = laid(None).draw_errors(places, 2000)
+    rng, pairs = np.random.default_rng(1), near_pairs(places, 1e3)
+    sample = np.cov(np.array([first_map_of(places, pairs, rng).positions_m.ravel() for _ in range(300)]).T)
+    _, covariance, bias, _ = first_map_of(places, pairs, draws=2000)
     assert bias == pytest.approx(np.zeros((6, 2)), abs=1e-3)
     spread = np.sqrt(covariance.diagonal())
     at = spread > 1e-9  # the origin and B's x are exact
@@ -272,29 +269,22 @@ def test_joint_errors_of_cosines_and_trilateration() -> None:
     ],
 )
 def test_motes_that_no_step_determines_are_refused(more: list[list[float]], what: str) -> None:
-    sketch = sketch_of(np.array([A, B, *more]))
-    sketch.set_axes(0, 1)
-    for mote in (2, 3, 4)[: len(more) - 1]:
-        sketch.add_by_cosines(mote, 0, 1)
+    places = np.array([A, B, *more])
     with pytest.raises(DegenerateStep, match=what):
-        sketch.add_by_cosines(2, 0, 1) if len(more) == 1 else sketch.add_by_ranges(5, (2, 3, 4))
+        first_map_of(places, near_pairs(places, 1e3))
 
 
 def test_a_missing_range_names_both_motes() -> None:
-    network = network_of(np.array([A, B, [1.0, 1.0]]), [(0, 1), (0, 2)])
-    sketch = Sketch(network, 60.0)
-    sketch.set_axes(0, 1)
     with pytest.raises(MappingError, match="no range between M1 and M2"):
-        sketch.add_by_cosines(2, 0, 1)
+        first_map_of(np.array([A, B, [1.0, 1.0]]), [(0, 1), (0, 2)])
 
 
 def test_exact_ranges_give_the_field_in_its_frame() -> None:
     network = network_of(TRUE_M, PLAN.phase1_pairs)
-    found = map_by_plan(PLAN, network, CRICKET.phase1.max_dop)
-    assert found.positions_m == pytest.approx(TRUE_M, abs=1e-6)
-    dops = [step.dop for step in found.steps if step.how == "trilateration"]
-    # three motes 0.5 m apart, 5 to 6 m away: some 14 to 20
-    assert 10.0 < min(dops) < max(dops) < 25.0
+    # three motes 0.5 m apart, 5 to 6 m away: dilutions of precision of some 14 to 20
+    assert map_by_plan(PLAN, network, 25.0).positions_m == pytest.approx(TRUE_M, abs=1e-6)
+    with pytest.raises(DegenerateStep, match=r"dilution of precision 1\d\.\d+ exceeds 10"):
+        map_by_plan(PLAN, network, 10.0)
 
 
 DRAWS = 800
