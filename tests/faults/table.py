@@ -167,10 +167,10 @@ KINDS = {
 }
 HEAD = """# The fault table
 
-What can break, how it shows, what then happens and by when. `tests/faults/table.toml` is the table; each row is shown
-by the tests that are marked for it, and a run of all tests fails if one is not. *Measured* is the worst case of those
-tests{where}. `make test`, `make test-slow` and then `make faults` write this page. What a row says of the robot
-itself, `ccatp conformance HOST:PORT` asks of any robot.
+This table lists possible faults, how each is detected, the reaction, and the bound of the reaction. Its source is
+`tests/faults/table.toml`. Each row has tests that are marked for it; a run of all tests fails if a row has none.
+*Measured* is the worst case of those tests{where}. `make test`, `make test-slow` and then `make faults` write this
+page. `ccatp conformance HOST:PORT` checks on any robot the rows about the robot itself.
 """
 COLUMNS = (
     "| | fault | shows by | reaction | severity | bound | measured | shown by |\n|---|---|---|---|---|---|---|---|"
