@@ -12,9 +12,9 @@ among four ZigBee radios, in two rooms, with slip and with shadowing.
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from math import atan2, degrees, inf, pi
+from math import atan2, degrees, pi
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from ccatp.beacons.slam.signal_slam import ReflectorScan
 from ccatp.beacons.steering import HALT
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.metrics import best_motion, rms, rms_m
+from ccatp.filters.metrics import best_motion, rms, rms_m, wrapped
 from ccatp.links.beacon_messages import RadioScan
 from ccatp.report.plots import INK
 from ccatp.sim.radio import SimDriveCommand, TruePose, TrueRadio
@@ -40,36 +40,33 @@ from ccatp.studies.results import LIMIT, Measure, Row, band, chi_square_band, co
 
 # -- a run with the truth beside the estimates -------------------------------------------------------------------------
 
-Place = tuple[float, float]  # x_m, y_m
-
 
 @dataclass(slots=True)
 class RadioRun:
-    """What a run leaves, one entry a step where nothing else is said; errors are estimate minus truth."""
+    """What a run leaves; errors are estimate minus truth.
 
-    truth: list[Place] = field(default_factory=list)
-    estimates: list[Place] = field(default_factory=list)
-    heading_errors_rad: list[float] = field(default_factory=list)
-    reckoned_errors: list[Place] = field(default_factory=list)  # of dead reckoning by the same odometry
+    ``steps``: x, y and heading, the same as estimated, x and y by dead reckoning alone, x and y of the moving radio and
+    where it is believed (NaN where there is none), and the distance to what stands in the room; shape (k, 13).
+    """
+
+    steps: FloatArray
     # By name, from the first estimate on: distance of estimate and truth, and NEES with 2 degrees of freedom.
-    beacon_errors_m: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    beacon_nees: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    nis: list[tuple[float, int]] = field(default_factory=list)  # of each reading, and its degrees of freedom
-    targets: list[Place] = field(default_factory=list)
-    believed: list[Place] = field(default_factory=list)
-    places: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)  # at the end: mean and truth
-    joint_nees: tuple[float, int] = (0.0, 0)  # at the end, of pose and static radios on the map; degrees of freedom
-    bound: RadioBound | None = None
-    nearest_m: float = inf  # to the target
-    clearance_m: float = inf  # least, from what stands in the room
+    beacon_errors_m: Mapping[str, list[float]]
+    beacon_nees: Mapping[str, list[float]]
+    nis: list[tuple[float, int]]  # of each reading, and its degrees of freedom
+    places: dict[str, tuple[FloatArray, FloatArray]]  # at the end: mean and truth
+    joint_nees: tuple[float, int]  # at the end, of pose and static radios on the map; degrees of freedom
+    bound: RadioBound | None
 
 
 def run_radio(cfg: RadioConfig) -> RadioRun:
     """A whole run; a function of the configuration and its seed."""
-    world, navigator, pilot, run = RadioWorld(cfg), RadioNavigator(cfg), BeaconPilot(cfg), RadioRun()
-    drive, observation, slam = HALT, cfg.observation, navigator.slam
-    truths: dict[str, Place] = {}
-    driven: list[TrueStep] = []
+    world, navigator, pilot = RadioWorld(cfg), RadioNavigator(cfg), BeaconPilot(cfg)
+    drive, observation, slam, target_name = HALT, cfg.observation, navigator.slam, cfg.follow.target
+    truths: dict[str, tuple[float, float]] = {}
+    driven, steps = list[TrueStep](), list[tuple[float, ...]]()
+    errors_m, squares = defaultdict[str, list[float]](list), defaultdict[str, list[float]](list)
+    nis: list[tuple[float, int]] = []
     for step in range(1, cfg.run.steps + 1):
         static, target = step % observation.every_steps == 0, step % observation.target_every_steps == 0
         frame = world.step(SimDriveCommand(*drive), cfg.run.step_s, static=static, target=target)
@@ -79,39 +76,27 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
         target_sight, distances_m = navigator.target(t_s), frame.extras.distances
         drive = pilot.drive(t_s, frame.wheels.interval_s, slam.pose, target_sight, distances_m)
         driven.append(TrueStep(world.pose, wheels[0], world.target_m))
-        truths = dict(world.beacons_m)
-        if world.target_m is not None:
-            truths[cfg.follow.target] = world.target_m
-        _note(run, world, navigator, truths, cfg.follow.target)
-    for name, estimate in slam.beacons.items():
-        run.places[str(name)] = (estimate.mean, np.array(truths[str(name)]))
-    run.bound = radio_bound(cfg, driven, list(world.beacons_m.values()), SETTLED_SHARE)
+        truths = world.beacons_m | ({} if world.target_m is None else {target_name: world.target_m})
+        nis += [(learned.nis, learned.size) for learned in slam.learned]
+        for name, estimate in slam.beacons.items():
+            off = estimate.mean - truths[str(name)]
+            errors_m[str(name)].append(float(np.hypot(*off)))
+            squares[str(name)].append(_nees(off, estimate.covariance))
+        sighted = slam.beacons.get(target_name)
+        believed = _NOWHERE if sighted is None else sighted.mean[:2].tolist()
+        target_m = world.target_m or _NOWHERE
+        steps.append((*world.pose, *slam.pose, *navigator.reckoned_m, *target_m, *believed, world.clearance_m))
+    places = {str(name): (estimate.mean, np.array(truths[str(name)])) for name, estimate in slam.beacons.items()}
+    bound = radio_bound(cfg, driven, list(world.beacons_m.values()), SETTLED_SHARE)
     # Radios whose readings still wait are not on the map.
     placed = [name for name in world.beacons_m if name in slam.engine]
     mean, covariance = slam.joint(placed)
     truth = np.concatenate([world.pose, *(world.beacons_m[name] for name in placed)])
-    run.joint_nees = _nees(mean - truth, covariance), truth.size
-    return run
+    joint_nees = _nees(mean - truth, covariance), truth.size
+    return RadioRun(np.array(steps), errors_m, squares, nis, places, joint_nees, bound)
 
 
-def _note(run: RadioRun, world: RadioWorld, navigator: RadioNavigator, truths: dict[str, Place], target: str) -> None:
-    true, slam = world.pose, navigator.slam
-    pose, (reckoned_x_m, reckoned_y_m) = slam.pose, navigator.reckoned_m
-    run.truth.append(true[:2])
-    run.estimates.append(pose[:2])
-    run.heading_errors_rad.append(wrap_pi(pose.heading_rad - true.heading_rad))
-    run.reckoned_errors.append((reckoned_x_m - true.x_m, reckoned_y_m - true.y_m))
-    run.nis += [(learned.nis, learned.size) for learned in slam.learned]
-    run.clearance_m = min(run.clearance_m, world.clearance_m)
-    for name, estimate in slam.beacons.items():
-        off = estimate.mean - truths[str(name)]
-        run.beacon_errors_m[str(name)].append(float(np.hypot(*off)))
-        run.beacon_nees[str(name)].append(_nees(off, estimate.covariance))
-    if world.target_m is not None:
-        run.targets.append(world.target_m)
-        run.nearest_m = min(run.nearest_m, float(np.hypot(world.target_m[0] - true.x_m, world.target_m[1] - true.y_m)))
-        believed = slam.beacons.get(target)
-        run.believed.append((np.nan, np.nan) if believed is None else (believed.mean[0], believed.mean[1]))
+_NOWHERE = (np.nan, np.nan)
 
 
 def _nees(error: FloatArray, covariance: FloatArray) -> float:
@@ -134,8 +119,7 @@ _MEANS = ("pose_m", "reckoned_m", "pose_aligned_m", "reckoned_aligned_m", "headi
 def run_job(job: Job) -> JobOutcome:
     """Figures of a run, and its errors over time."""
     run, target = run_radio(job.cfg), job.cfg.follow.target
-    truth, estimates = np.array(run.truth), np.array(run.estimates)
-    reckoned = truth + np.array(run.reckoned_errors)
+    truth, estimates, reckoned, targets, believed = (run.steps[:, k : k + 2].copy() for k in (0, 3, 6, 8, 10))
     motion, reckoned_motion = best_motion(estimates, truth), best_motion(reckoned, truth)
     finals = {name: place for name, place in run.places.items() if name != target}
     values: dict[str, Any] = {
@@ -149,25 +133,25 @@ def run_job(job: Job) -> JobOutcome:
         "pose_aligned_m": rms_m(motion.moved(estimates), truth),
         "reckoned_m": rms_m(reckoned, truth),
         "reckoned_aligned_m": rms_m(reckoned_motion.moved(reckoned), truth),
-        "heading_rad": rms(np.array(run.heading_errors_rad)),
+        "heading_rad": rms(wrapped(run.steps[:, 5] - run.steps[:, 2])),
         "nis": [sum(nis for nis, _ in run.nis), sum(size for _, size in run.nis)],
         "nees": list(run.joint_nees),
-        "collided": run.clearance_m < 0.0,
+        "collided": bool(run.steps[:, 12].min() < 0.0),
         "beacons_rms_m": rms(np.array([np.hypot(*(mean - true)) for mean, true in finals.values()])),
     }
     if run.bound is not None:
         values |= {"beacons_bound_m": run.bound.beacons_m, "target_bound_m": run.bound.target_m}
     arrays = {"beacons_m": _curve([run.beacon_errors_m[name] for name in finals], len(truth))}
-    if run.targets:
-        first = round(SETTLED_SHARE * len(run.targets))
-        targets, believed = np.array(run.targets)[first:], np.array(run.believed)[first:]
+    if np.isfinite(targets[0, 0]):
+        nearest_m = float(np.hypot(*(targets - truth).T).min())
+        targets, believed = (places[round(SETTLED_SHARE * len(truth)) :] for places in (targets, believed))
         known = np.isfinite(believed[:, 0])
         covered = np.array(run.beacon_nees.get(target, [np.inf]))[-len(targets) :] < _HIT
         values |= {
             "target_m": rms_m(believed[known], targets[known]),
             "target_aligned_m": rms_m(motion.moved(believed)[known], targets[known]),
             "target_covered": float(np.mean(covered)),
-            "nearest_m": run.nearest_m,
+            "nearest_m": nearest_m,
         }
         arrays["target_m"] = _curve([run.beacon_errors_m.get(target, [])], len(truth))
     return JobOutcome(values, arrays)
