@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.config.load import available, load_config
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import available, load_config, load_radio_config
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, motor_robot, survey_robot
 from ccatp.links.robot_codec import decode_from_robot
@@ -27,6 +28,12 @@ def config_of(mirror: str = "fyst-m1", **overrides: object) -> Config:
     """The default configuration with changes; `run__seed=3` is the key `run.seed`."""
     dotted = {key.replace("__", "."): value for key, value in overrides.items()}
     return load_config(overrides={"run.mirror": mirror, **dotted})
+
+
+def radio_config_of(system: str = "zigbee", /, **overrides: Any) -> RadioConfig:
+    """The shipped configuration of robots among beacons with changes, likewise."""
+    dotted = {key.replace("__", "."): value for key, value in overrides.items()}
+    return load_radio_config(None, {"system": system, **dotted})
 
 
 @cache

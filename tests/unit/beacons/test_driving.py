@@ -10,17 +10,13 @@ from scipy.stats import chi2
 from ccatp.beacons.pilot import BackOff, BeaconPilot, FollowState, PilotState, TargetSight
 from ccatp.beacons.steering import HALT, FuzzyGapError, Point, Sugeno
 from ccatp.config.beacon_models import FuzzyConfig, RadioConfig
-from ccatp.config.load import load_radio_config
 from ccatp.sim.radio import SimDriveCommand, TruePose, clearance_m, seen_m
 from ccatp.sim.radio_world import TrueVehicle
 from ccatp.studies.mote_navigation import BeaconSilResult, rehearse_beacons
-from tests.unit.beacons.test_mission import beacon_config, target_distances
+from tests.support.scenario import radio_config_of
+from tests.unit.beacons.test_mission import target_distances
 
-QUIET = {f"sim.vehicle.{name}": 0.0 for name in ("speed_sigma_m_s", "steer_sigma_rad", "turn_rate_sigma_rad_s")}
-
-
-def config(**keys: object) -> RadioConfig:
-    return load_radio_config(None, {**QUIET, **{name.replace("__", "."): value for name, value in keys.items()}})
+QUIET = {f"sim__vehicle__{name}": 0.0 for name in ("speed_sigma_m_s", "steer_sigma_rad", "turn_rate_sigma_rad_s")}
 
 
 def vehicle(cfg: RadioConfig, pose: tuple[float, float, float]) -> TrueVehicle:
@@ -30,7 +26,7 @@ def vehicle(cfg: RadioConfig, pose: tuple[float, float, float]) -> TrueVehicle:
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
 @pytest.mark.parametrize("mode", ["fuzzy", "pi", "constant"])
 def test_a_loop_of_waypoints_is_visited(kind: str, mode: str) -> None:
-    cfg = config(vehicle__kind=kind, control__speed_mode=mode, workspace__loops=False)
+    cfg = radio_config_of(vehicle__kind=kind, control__speed_mode=mode, workspace__loops=False, **QUIET)
     robot, pilot = vehicle(cfg, (0.8, 0.8, 0.0)), BeaconPilot(cfg)
     for step in range(2000):
         drive = pilot.drive(0.1 * step, 0.1, robot.pose, None, ())
@@ -55,7 +51,7 @@ def follow(cfg: RadioConfig, start: tuple[float, float, float], path: list[tuple
 
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
 def test_a_target_is_approached_to_the_safe_distance_and_no_further(kind: str) -> None:
-    cfg = config(vehicle__kind=kind, follow__is_active=True)
+    cfg = radio_config_of(vehicle__kind=kind, follow__is_active=True, **QUIET)
     distances = follow(cfg, (0.0, 0.0, 0.0), [(2.0, 1.0)] * 600)
     safe_m, band_m = cfg.follow.safe_distance_m, cfg.follow.band_m
     assert safe_m < distances[-1] < safe_m + 2.0 * band_m
@@ -63,14 +59,14 @@ def test_a_target_is_approached_to_the_safe_distance_and_no_further(kind: str) -
 
 
 def test_a_target_that_comes_nearer_is_backed_off_from() -> None:
-    cfg = config(follow__is_active=True)
+    cfg = radio_config_of(follow__is_active=True, **QUIET)
     coming = [(1.0 - 0.002 * k, 0.0) for k in range(400)]  # 2 cm/s towards the robot
     distances = follow(cfg, (0.0, 0.0, 0.0), coming + coming[-1:] * 200)
     assert min(distances) > cfg.follow.safe_distance_m - 0.01  # it backs faster than the target comes, after a start
 
 
 def test_uncertainty_of_the_target_keeps_the_robot_away() -> None:
-    pilot = BeaconPilot(config(follow__is_active=True))
+    pilot = BeaconPilot(radio_config_of(follow__is_active=True, **QUIET))
     pilot.drive(0.0, 0.1, (0.0, 0.0, 0.0), TargetSight((0.8, 0.0), 0.0, 0.0), ())
     states = [pilot.follower.state]
     for sigma_m, velocity_m_s in ((0.05, 0.0), (0.25, 0.0), (0.0, -0.1)):  # surer; unsure; sure, but it comes
@@ -82,7 +78,7 @@ def test_uncertainty_of_the_target_keeps_the_robot_away() -> None:
 
 @pytest.mark.parametrize("target", [None, TargetSight((3.0, 0.0), 0.0, 11.0)])
 def test_a_lost_target_stops_the_robot(target: TargetSight | None) -> None:
-    pilot = BeaconPilot(config(follow__is_active=True))
+    pilot = BeaconPilot(radio_config_of(follow__is_active=True, **QUIET))
     assert pilot.drive(0.0, 0.1, (0.0, 0.0, 0.0), target, ()) == HALT
     assert pilot.follower.state is FollowState.LOST
 
@@ -90,8 +86,12 @@ def test_a_lost_target_stops_the_robot(target: TargetSight | None) -> None:
 @pytest.mark.parametrize("side", [-0.1, 0.0, 0.1])
 def test_an_obstacle_in_the_way_is_gone_round(side: float) -> None:
     obstacle = [{"x_m": 1.5, "y_m": 1.5 + side, "radius_m": 0.15}]
-    cfg = config(
-        avoidance__is_active=True, workspace__waypoints_m=[[2.7, 1.5]], workspace__loops=False, sim__obstacles=obstacle
+    cfg = radio_config_of(
+        avoidance__is_active=True,
+        workspace__waypoints_m=[[2.7, 1.5]],
+        workspace__loops=False,
+        sim__obstacles=obstacle,
+        **QUIET,
     )
     robot, pilot = vehicle(cfg, (0.3, 1.5, 0.0)), BeaconPilot(cfg)
     nearest_m, states = 9.0, set()
@@ -108,7 +108,7 @@ def test_an_obstacle_in_the_way_is_gone_round(side: float) -> None:
 
 
 def test_what_stands_too_near_ahead_is_escaped_from_backwards() -> None:
-    cfg = config(avoidance__is_active=True, workspace__waypoints_m=[[2.7, 1.5]])
+    cfg = radio_config_of(avoidance__is_active=True, workspace__waypoints_m=[[2.7, 1.5]], **QUIET)
     seen = [0.2 if abs(angle) < 0.6 else 3.0 for angle in cfg.avoidance.sensors_rad]
     pilot = BeaconPilot(cfg)
     drive = pilot.drive(0.0, 0.1, (0.3, 1.5, 0.0), None, seen)
@@ -117,7 +117,7 @@ def test_what_stands_too_near_ahead_is_escaped_from_backwards() -> None:
 
 
 def test_nothing_is_backed_into_that_was_seen_before() -> None:
-    cfg = config(avoidance__is_active=True, follow__is_active=True)
+    cfg = radio_config_of(avoidance__is_active=True, follow__is_active=True, **QUIET)
     pilot = BeaconPilot(cfg)
     all_round = [0.3] * len(cfg.avoidance.sensors_rad)
     pilot.drive(0.0, 0.1, (0.0, 0.0, pi), None, all_round)  # looks back
@@ -161,13 +161,9 @@ STILL = (0.0, 0.0)
 POSE = (1.5, 1.5, 0.0)
 
 
-def retreat_config(**keys: object) -> RadioConfig:
-    return load_radio_config(None, {"system": "follow", **{k.replace("__", "."): v for k, v in keys.items()}})
-
-
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
 def test_it_goes_straight_away_where_nothing_stands(kind: str) -> None:
-    retreat = BackOff(retreat_config(vehicle__kind=kind))
+    retreat = BackOff(radio_config_of("follow", vehicle__kind=kind))
     ahead = retreat.drive(POSE, (2.0, 1.5), STILL, ())
     assert ahead.speed_m_s == -0.05
     assert (ahead.steer_rad, ahead.turn_rate_rad_s) == (0.0, 0.0)
@@ -193,14 +189,14 @@ RING += [(1.5 - 0.25, 1.5 - 0.25), (1.5, 1.14), (1.75, 1.25)]
 def test_ways_to_back_off(
     pose: tuple[float, float, float], threat: Point, velocity: Point, obstacles: list[Point], signs: set[int]
 ) -> None:
-    speed_m_s = BackOff(retreat_config()).drive(pose, threat, velocity, obstacles).speed_m_s
+    speed_m_s = BackOff(radio_config_of("follow")).drive(pose, threat, velocity, obstacles).speed_m_s
     assert (speed_m_s > 0.0) - (speed_m_s < 0.0) in signs
 
 
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
 def test_a_robot_between_an_obstacle_and_a_target_that_comes_gets_out(kind: str) -> None:
     """Backing off straight alone, it stood at the obstacle until the target was 0.23 m away."""
-    cfg = retreat_config(vehicle__kind=kind, **QUIET)
+    cfg = radio_config_of("follow", vehicle__kind=kind, **QUIET)
     robot = vehicle(cfg, (2.15, 1.5, 0.4))
     pilot, distances, clearances = BeaconPilot(cfg), [], []
     x, y = 2.75, 1.8
@@ -243,12 +239,12 @@ def nees_at(found: BeaconSilResult, t_s: float) -> float:
 
 @pytest.fixture(scope="module")
 def by_motes() -> list[BeaconSilResult]:
-    return [rehearse_beacons(beacon_config("cricket", run__seed=seed)) for seed in (1, 2)]
+    return [rehearse_beacons(radio_config_of("cricket", run__seed=seed)) for seed in (1, 2)]
 
 
 @MISSIONS
 def test_radios_are_mapped_and_all_waypoints_visited() -> None:
-    summary = rehearse_beacons(beacon_config("zigbee", run__seed=1)).summary
+    summary = rehearse_beacons(radio_config_of("zigbee", run__seed=1)).summary
     assert summary["outcome"] == "complete"
     assert summary["waypoints"] == {"total": 8, "reached": 8, "within_3_sigma": 8}
     assert summary["beacons"]["mapped"] == 4
@@ -260,7 +256,7 @@ def test_radios_are_mapped_and_all_waypoints_visited() -> None:
 def test_slip_and_drift_are_seen_through() -> None:
     stress = {"sim__vehicle__slip": 0.05, "sim__vehicle__heading_drift_rad_s": 0.0087}
     known = {"odometry__slip_sigma": 0.05, "odometry__heading_drift_sigma_rad_s": 0.01}
-    summary = rehearse_beacons(beacon_config("zigbee", **stress, **known)).summary
+    summary = rehearse_beacons(radio_config_of("zigbee", **stress, **known)).summary
     assert summary["outcome"] == "complete"
     assert summary["position_error_m"]["rmse"] < 0.5 * summary["dead_reckoning_rmse_m"]
 
@@ -293,7 +289,7 @@ def test_navigation_by_motes_knows_how_good_it_is(by_motes: list[BeaconSilResult
 @MISSIONS
 def test_the_target_is_followed_at_its_distance_and_the_obstacle_left_alone() -> None:
     for seed in (1, 2):
-        cfg = beacon_config("follow", run__seed=seed, mission__follow_s=60.0)
+        cfg = radio_config_of("follow", run__seed=seed, mission__follow_s=60.0)
         found = rehearse_beacons(cfg)
         assert found.outcome == "complete"
         assert not found.summary["obstacles"]["touched"]
@@ -305,7 +301,7 @@ def test_the_target_is_followed_at_its_distance_and_the_obstacle_left_alone() ->
 @MISSIONS
 @pytest.mark.slow
 def test_fifty_missions_by_motes_are_consistent() -> None:
-    runs = [rehearse_beacons(beacon_config("cricket", run__seed=seed)) for seed in range(100, 150)]
+    runs = [rehearse_beacons(radio_config_of("cricket", run__seed=seed)) for seed in range(100, 150)]
     low, high = band(3 * len(runs), 0.95)
     assert low < sum(nees_at(found, 60.0) for found in runs) < high
     reached = sum(found.summary["waypoints"]["within_3_sigma"] for found in runs)
@@ -316,4 +312,4 @@ def test_fifty_missions_by_motes_are_consistent() -> None:
 @pytest.mark.slow
 def test_no_obstacle_is_touched_in_fifty_missions() -> None:
     for seed in range(1, 51):
-        assert not rehearse_beacons(beacon_config("follow", run__seed=seed)).summary["obstacles"]["touched"], seed
+        assert not rehearse_beacons(radio_config_of("follow", run__seed=seed)).summary["obstacles"]["touched"], seed

@@ -15,8 +15,6 @@ from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.store import BeaconStore, BeaconStoreError
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.load import load_radio_config
-from ccatp.config.package import configs_dir
 from ccatp.core import EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
@@ -29,15 +27,10 @@ from ccatp.sim.radio_world import RadioWorld
 from ccatp.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
 from ccatp.survey.events import DONE, HELD, VISITING, Abort, Fault, Pause, Resume, StopHere
 from ccatp.survey.state import HoldState
+from tests.support.scenario import radio_config_of
 
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 DENIED = Verdict(0, 0.0, EventCode.NORMAL, "no radio", "radio", 8.0, 7.0, False, False, False, severity=Severity.HOLD)
-
-
-def beacon_config(system: str, **overrides: Any) -> RadioConfig:
-    """The shipped configuration of a system; dots in keys are written as two underscores."""
-    keys = {name.replace("__", "."): value for name, value in overrides.items()}
-    return load_radio_config(Path(configs_dir() / f"{system}.toml"), keys)
 
 
 def play(stage: BeaconSilWorld, until_s: float = 1e9) -> BeaconSilWorld:
@@ -60,7 +53,7 @@ def moved_m(found: BeaconSilResult, from_s: float, until_s: float) -> float:
 
 @pytest.fixture
 def stage() -> BeaconSilWorld:
-    return play(BeaconSilWorld(beacon_config("zigbee")), until_s=10.0)
+    return play(BeaconSilWorld(radio_config_of("zigbee")), until_s=10.0)
 
 
 def test_pause_holds_until_resume(stage: BeaconSilWorld) -> None:
@@ -118,7 +111,7 @@ NOTHING = Verdict(0, 0.0, EventCode.NEAR_EDGE, "", "", 0.0, 0.0, False, False, F
 
 @pytest.fixture
 def cfg() -> RadioConfig:
-    return beacon_config("zigbee")
+    return radio_config_of("zigbee")
 
 
 def frame_of(robot: BeaconRobot) -> tuple[Sensors, BeaconFrame]:
@@ -190,7 +183,7 @@ def test_wheels_steering_and_scans_are_read_from_the_link(cfg: RadioConfig) -> N
 
 
 def test_a_scan_on_the_link_keeps_its_directions() -> None:
-    cfg = beacon_config("zigbee", sim__radio__scan="reflector", observation__every_steps=1)
+    cfg = radio_config_of("zigbee", sim__radio__scan="reflector", observation__every_steps=1)
     world = RadioWorld(cfg)
     robot = BeaconRobot(cfg, world)
     robot.advance()
@@ -232,7 +225,7 @@ def test_extra_keys_out_of_range_are_a_bad_line(cfg: RadioConfig) -> None:
 
 
 def test_the_danger_rules_find_the_target_by_its_level() -> None:
-    cfg = beacon_config("follow")
+    cfg = radio_config_of("follow")
     danger, robot = BeaconSafetyRules(cfg), BeaconRobot(cfg, RadioWorld(cfg))
     sensors, _ = frame_of(robot)
     for level_dbm, is_near in ((-36.0, False), (-28.0, True)):  # at 1 m, at 0.4 m
@@ -266,7 +259,7 @@ def test_another_robot_is_refused(system: str, keys: dict[str, Any], what: str, 
     if system == "mirror":
         hello.robot.vehicle = None
     with pytest.raises(ConfigError, match=what):
-        check_beacon_robot(cfg if system == "mirror" else beacon_config(system, **keys), hello)
+        check_beacon_robot(cfg if system == "mirror" else radio_config_of(system, **keys), hello)
 
 
 def test_a_summary_without_truth_holds_what_needs_none(cfg: RadioConfig) -> None:
@@ -301,7 +294,7 @@ def test_the_store_keeps_what_was_reached(cfg: RadioConfig, tmp_path: Path) -> N
 
 
 def test_pulses_of_unknown_motes_are_left_out() -> None:
-    own = SelfMap(beacon_config("cricket").cricket)
+    own = SelfMap(radio_config_of("cricket").cricket)
     own.take(MoteBurst(0.0, "stranger", "N1-1", 20.0, [0.01]))
     own.take(MoteBurst(0.0, "N1-1", "robot", 20.0, [0.01]))
     assert own.places is None
@@ -315,7 +308,7 @@ FASTER = {**COMING, "for_s": 8.0, "speed_m_s": 0.12}
 
 
 def test_silence_of_all_radios_holds_the_robot_until_they_are_heard_again() -> None:
-    cfg = beacon_config("zigbee", sim__incidents=[SILENCE])
+    cfg = radio_config_of("zigbee", sim__incidents=[SILENCE])
     found = play(BeaconSilWorld(cfg)).result()
     held = [t_s for t_s, state in zip(found.times_s, found.states, strict=True) if state == "held"]
     # The last scan before the silence is at 18 s, the first after it at 42 s.
@@ -337,7 +330,7 @@ def test_silence_of_all_radios_holds_the_robot_until_they_are_heard_again() -> N
     ],
 )
 def test_what_lasts_needs_an_operator(keys: dict[str, Any], cause: str) -> None:
-    stage = play(BeaconSilWorld(beacon_config("zigbee", mission__laps=1, **keys)))
+    stage = play(BeaconSilWorld(radio_config_of("zigbee", mission__laps=1, **keys)))
     assert stage.mission.state.is_faulted
     assert stage.mission.state.cause.startswith(cause)
     assert (stage.found.verdicts[-1].severity is Severity.FAULT) == ("received" in cause)
@@ -346,13 +339,13 @@ def test_what_lasts_needs_an_operator(keys: dict[str, Any], cause: str) -> None:
 
 def test_one_radio_less_is_no_silence() -> None:
     silence = {**SILENCE, "beacons": ["beacon1"]}
-    found = play(BeaconSilWorld(beacon_config("zigbee", mission__laps=1, sim__incidents=[silence]))).result()
+    found = play(BeaconSilWorld(radio_config_of("zigbee", mission__laps=1, sim__incidents=[silence]))).result()
     assert found.outcome == "complete"
     assert found.summary["danger"] == {}
 
 
 def test_a_thing_in_the_way_is_not_run_into_without_avoidance() -> None:
-    cfg = beacon_config("zigbee", mission__laps=1, sim__incidents=[THING])
+    cfg = radio_config_of("zigbee", mission__laps=1, sim__incidents=[THING])
     found = play(BeaconSilWorld(cfg)).result()
     near = [verdict for verdict in found.verdicts if verdict.code is EventCode.NEAR_EDGE]
     assert near
@@ -362,7 +355,7 @@ def test_a_thing_in_the_way_is_not_run_into_without_avoidance() -> None:
 
 
 def test_the_robot_backs_off_from_a_target_that_comes() -> None:
-    cfg = beacon_config("follow", mission__follow_s=45.0, sim__incidents=[COMING], sim__obstacles=[])
+    cfg = radio_config_of("follow", mission__follow_s=45.0, sim__incidents=[COMING], sim__obstacles=[])
     found = play(BeaconSilWorld(cfg)).result()
     distances, speeds = target_distances(found), np.array(found.speeds_m_s)
     during = (np.array(found.times_s) > 30.0) & (np.array(found.times_s) < 40.0)
@@ -372,7 +365,7 @@ def test_the_robot_backs_off_from_a_target_that_comes() -> None:
 
 
 def test_no_motion_towards_a_target_that_comes_faster_than_the_robot_backs() -> None:
-    cfg = beacon_config("follow", mission__follow_s=45.0, sim__incidents=[FASTER], sim__obstacles=[])
+    cfg = radio_config_of("follow", mission__follow_s=45.0, sim__incidents=[FASTER], sim__obstacles=[])
     found = play(BeaconSilWorld(cfg)).result()
     distances, speeds = target_distances(found), np.array(found.speeds_m_s)
     assert distances.min() < cfg.danger.target_m
@@ -381,7 +374,7 @@ def test_no_motion_towards_a_target_that_comes_faster_than_the_robot_backs() -> 
 
 
 def test_fire_sends_the_robot_to_its_start() -> None:
-    stage = play(BeaconSilWorld(beacon_config("zigbee")), until_s=30.0)
+    stage = play(BeaconSilWorld(radio_config_of("zigbee")), until_s=30.0)
     assert stage.danger.emergency("fire", "a") is None
     found = play(stage).result()
     assert found.outcome == "aborted, at base"
@@ -391,7 +384,7 @@ def test_fire_sends_the_robot_to_its_start() -> None:
 
 
 def test_nothing_moves_in_an_earthquake_and_then_the_robot_returns() -> None:
-    stage = play(BeaconSilWorld(beacon_config("zigbee")), until_s=20.0)
+    stage = play(BeaconSilWorld(radio_config_of("zigbee")), until_s=20.0)
     stage.danger.emergency("earthquake", "a")
     play(stage, until_s=30.0)
     assert stage.mission.state.mode == "held"
@@ -403,7 +396,7 @@ def test_nothing_moves_in_an_earthquake_and_then_the_robot_returns() -> None:
 
 
 def test_a_pose_too_uncertain_holds_until_readings_help() -> None:
-    cfg = beacon_config("zigbee", start__position_sigma_m=0.6, danger__hold_limit_s=600.0)
+    cfg = radio_config_of("zigbee", start__position_sigma_m=0.6, danger__hold_limit_s=600.0)
     stage = play(BeaconSilWorld(cfg), until_s=10.0)
     assert stage.mission.state.mode == "held"
     assert stage.mission.state.cause == "the position is too uncertain"

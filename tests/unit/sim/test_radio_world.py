@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from ccatp.config.beacon_models import CricketConfig, RadioConfig, SimObstacleConfig
-from ccatp.config.load import load_radio_config
 from ccatp.core import wrap_pi
 from ccatp.sim.motes import MoteField, MotePulse, TrueMotes, true_motes, usable_reach
 from ccatp.sim.radio import (
@@ -21,12 +20,9 @@ from ccatp.sim.radio import (
     seen_m,
 )
 from ccatp.sim.radio_world import RadioWorld
+from tests.support.scenario import radio_config_of
 
 BALL = SimObstacleConfig(x_m=1.0, y_m=0.0, radius_m=0.2)
-
-
-def config(**keys: object) -> RadioConfig:
-    return load_radio_config(None, {name.replace("__", "."): value for name, value in keys.items()})
 
 
 def radio(cfg: RadioConfig, obstacles: tuple[SimObstacleConfig, ...] = ()) -> TrueRadio:
@@ -49,7 +45,7 @@ EXACT = {"sim__vehicle__start_position_offset_m": 0.0, "sim__vehicle__start_head
     [(0.1, 0.3, 0.01), (9.0, 0.0, 0.015)],  # as printed; cut to the limits
 )
 def test_ackermann_steps(speed_m_s: float, steer_rad: float, way_m: float) -> None:
-    world = drive(config(**EXACT), SimDriveCommand(speed_m_s, steer_rad, 0.0), 1)
+    world = drive(radio_config_of(**EXACT), SimDriveCommand(speed_m_s, steer_rad, 0.0), 1)
     turn_rad = way_m * np.sin(steer_rad) / 0.35
     wanted = 0.8 + way_m * np.cos(steer_rad), 0.8 + way_m * np.sin(steer_rad), turn_rad
     assert world.pose == pytest.approx(wanted)
@@ -57,7 +53,7 @@ def test_ackermann_steps(speed_m_s: float, steer_rad: float, way_m: float) -> No
 
 def test_differential_drive_goes_along_a_circle() -> None:
     world = drive(
-        config(vehicle__kind="differential", **EXACT), SimDriveCommand(0.1, 0.0, 0.5), round(2 * pi / 0.05) * 1
+        radio_config_of(vehicle__kind="differential", **EXACT), SimDriveCommand(0.1, 0.0, 0.5), round(2 * pi / 0.05) * 1
     )
     centre = (0.8, 0.8 + 0.1 / 0.5)
     assert hypot(world.pose.x_m - centre[0], world.pose.y_m - centre[1]) == pytest.approx(0.2, abs=1e-6)
@@ -65,7 +61,7 @@ def test_differential_drive_goes_along_a_circle() -> None:
 
 def test_slip_and_drift_are_not_in_the_odometry() -> None:
     quiet = {"sim__vehicle__speed_sigma_m_s": 0.0, "sim__vehicle__steer_sigma_rad": 0.0}
-    cfg = config(**EXACT, **quiet, sim__vehicle__slip=0.05, sim__vehicle__heading_drift_rad_s=0.01)
+    cfg = radio_config_of(**EXACT, **quiet, sim__vehicle__slip=0.05, sim__vehicle__heading_drift_rad_s=0.01)
     world = RadioWorld(cfg)
     frame = world.step(SimDriveCommand(0.1, 0.0, 0.0), 0.1, static=False, target=False)
     assert world.pose.x_m == pytest.approx(0.8 + 0.01 * 0.95)
@@ -75,22 +71,22 @@ def test_slip_and_drift_are_not_in_the_odometry() -> None:
 
 def test_level_follows_the_log_distance_model() -> None:
     for distance_m in (0.5, 1.0, 3.0):
-        (ray,) = radio(config()).rays(TruePose(0.0, 0.0, 0.0), (distance_m, 0.0))
+        (ray,) = radio(radio_config_of()).rays(TruePose(0.0, 0.0, 0.0), (distance_m, 0.0))
         assert ray.level_dbm == pytest.approx(-33.0 - 20.0 * log10(distance_m))
 
 
 def test_white_noise_has_its_spread_and_steps() -> None:
-    one = radio(config(sim__radio__resolution_db=0.0))
+    one = radio(radio_config_of(sim__radio__resolution_db=0.0))
     levels = [s[0] for _ in range(4000) if (s := one.sight(TruePose(0.0, 0.0, 0.0), (1.0, 0.0)))]
     assert np.mean(levels) == pytest.approx(-33.0, abs=0.12)  # 4 sigma of the mean
     assert np.std(levels) == pytest.approx(2.0, abs=0.1)
-    whole = radio(config()).sight(TruePose(0.0, 0.0, 0.0), (1.0, 0.0))
+    whole = radio(radio_config_of()).sight(TruePose(0.0, 0.0, 0.0), (1.0, 0.0))
     assert whole is not None
     assert whole[0] == round(whole[0])
 
 
 def test_drawn_bearings_lie_on_steps_of_nine_degrees() -> None:
-    one = radio(config())
+    one = radio(radio_config_of())
     errors = []
     for _ in range(2000):
         sighting = one.sight(TruePose(0.0, 0.0, 0.3), (0.0, 2.0))
@@ -102,7 +98,7 @@ def test_drawn_bearings_lie_on_steps_of_nine_degrees() -> None:
 
 
 def test_a_turn_of_the_reflector_is_strongest_towards_the_radio() -> None:
-    one = radio(config(sim__radio__white_sigma_db=0.0))
+    one = radio(radio_config_of(sim__radio__white_sigma_db=0.0))
     levels = np.array(one.scan(TruePose(0.0, 0.0, 0.5), (2.0, 0.0)))
     assert len(levels) == 40
     assert abs(wrap_pi(np.radians(9.0) * levels.argmax() + 0.5)) < np.radians(18.0)  # ties by whole decibels
@@ -110,18 +106,20 @@ def test_a_turn_of_the_reflector_is_strongest_towards_the_radio() -> None:
 
 
 def test_packets_are_lost_as_often_as_told_and_below_the_sensitivity() -> None:
-    one = radio(config(sim__radio__loss_probability=0.3))
+    one = radio(radio_config_of(sim__radio__loss_probability=0.3))
     lost = sum(one.scan(TruePose(0.0, 0.0, 0.0), (1.0, 0.0)).count(None) for _ in range(50))
     assert lost == pytest.approx(0.3 * 2000, abs=4 * (2000 * 0.21) ** 0.5)
-    weak = radio(config(sim__radio__sensitivity_dbm=-20.0))
+    weak = radio(radio_config_of(sim__radio__sensitivity_dbm=-20.0))
     assert weak.scan(TruePose(0.0, 0.0, 0.0), (1.0, 0.0)) == 40 * [None]
 
 
 def test_an_obstacle_in_the_line_of_sight_weakens_and_lets_a_reflection_win() -> None:
     here, there = TruePose(0.0, 0.0, 0.0), (2.0, 0.0)
-    free, blocked = radio(config()), radio(config(), (BALL,))
+    free, blocked = radio(radio_config_of()), radio(radio_config_of(), (BALL,))
     assert free.rays(here, there)[0].level_dbm - blocked.rays(here, there)[0].level_dbm == pytest.approx(6.0)
-    cfg = config(sim__radio__multipath_paths=6, sim__radio__multipath_level_db=1.0, sim__radio__obstacle_loss_db=40.0)
+    cfg = radio_config_of(
+        sim__radio__multipath_paths=6, sim__radio__multipath_level_db=1.0, sim__radio__obstacle_loss_db=40.0
+    )
     sighting = radio(cfg, (BALL,)).sight(here, there)
     assert sighting is not None
     strongest = max(radio(cfg, (BALL,)).rays(here, there)[1:], key=lambda ray: ray.level_dbm)
@@ -154,7 +152,7 @@ def test_obstacles_are_seen_between_and_along_rays() -> None:
 
 
 def test_a_random_target_keeps_its_speed_and_stays_in_the_room_and_out_of_obstacles() -> None:
-    cfg = config(sim__target__motion="random", sim__target__speed_m_s=0.1)
+    cfg = radio_config_of(sim__target__motion="random", sim__target__speed_m_s=0.1)
     target = MovingTarget(cfg.sim.target, (3.0, 3.0), [BALL], np.random.default_rng(3))
     for _ in range(5000):
         before = target.position_m
@@ -167,7 +165,7 @@ def test_a_random_target_keeps_its_speed_and_stays_in_the_room_and_out_of_obstac
 
 
 def test_a_seed_repeats_itself_and_listening_does_not_change_the_rest() -> None:
-    cfg = load_radio_config(None, {"system": "follow"})
+    cfg = radio_config_of("follow")
     worlds = [RadioWorld(cfg), RadioWorld(cfg)]
     frames = [
         [world.step(SimDriveCommand(0.1, 0.1, 0.0), 0.1, static=listens, target=True) for _ in range(20)]
@@ -184,8 +182,7 @@ def test_a_seed_repeats_itself_and_listening_does_not_change_the_rest() -> None:
 
 
 def mote_config(**keys: Any) -> CricketConfig:
-    dotted = {f"cricket.{name.replace('__', '.')}": value for name, value in keys.items()}
-    return load_radio_config(None, {"system": "cricket", **dotted}).cricket
+    return radio_config_of("cricket", **{f"cricket__{name}": value for name, value in keys.items()}).cricket
 
 
 def field(cfg: CricketConfig, places: list[list[float]], facings: list[list[float]] | None = None) -> MoteField:
