@@ -1,4 +1,4 @@
-"""Behaviours of a survey, frozen values: standing until a measurement, backing off an edge, driving home."""
+"""Behaviours of a survey as frozen values: settle for a measurement, retreat from an edge, drive home."""
 
 from enum import StrEnum
 from math import copysign, hypot
@@ -12,20 +12,20 @@ from ccatp.control.tracker import LegMotion, LegPhase, LegTracker
 from ccatp.core import EventCode, PanelPose, PointId, Stop, StopKind, Twist, Verdict, difference
 from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
 
-# Sums of frame periods are not exact: half a nanosecond must not cost a frame.
+# Tolerance for the rounding of sums of frame periods, which must not cost a frame.
 TIME_EPSILON_S = 5e-10
-# Wheels stop within half a second: a robot that is not at rest after this long creeps, or its sensors say so.
+# Wheels stop within half a second. A robot that is not at rest after this time creeps, or its sensors are wrong.
 SETTLE_LIMIT_S = 10.0
 STILL = Twist(0.0, 0.0)
 
 
 class MissionCommand(msgspec.Struct, frozen=True):
-    """What the mission wants of the present frame."""
+    """The command of the mission for one frame."""
 
     twist: Twist
     at_rest: bool = False  # the robot has come to rest in this frame
-    arrived: PointId | None = None  # the point at which it did so for the first time; corrections are no arrivals
-    measure: bool = False  # of a point, or after a back-off to find itself again
+    arrived: PointId | None = None  # the point, if it came to rest there for the first time (not after a correction)
+    measure: bool = False  # request a measurement: of a point, or to relocalize
     inflates_covariance: bool = False
 
 
@@ -33,9 +33,9 @@ HOLD_POSITION = MissionCommand(STILL)
 
 
 class Standstill(msgspec.Struct, frozen=True):
-    """At rest: both speeds, or both of their running means, have been below the limits for the settling time.
+    """Detects rest: both speeds, or both running means, have been below the limits for the settling time.
 
-    Fans shake the body with a mean of zero; wheels that run down, or that creep, move the mean as well.
+    The means are used because the fans shake the body with zero mean; wheels that run down or creep move the mean.
     """
 
     is_rest: bool = False
@@ -65,20 +65,20 @@ class Settling(msgspec.Struct, frozen=True, tag=True):
     """From the end of a leg to the request for a measurement, after standing for the measuring time."""
 
     standstill: Standstill = Standstill()
-    rest_by_s: float | None = None  # coming to rest, or standing still for the measurement, takes no longer
-    measure_at_s: float = 0.0  # the measuring time is over
-    is_requested: bool = False  # the measurement is asked for and wanted
-    is_repeated: bool = False  # it failed, and is asked for once more after another measuring time
+    rest_by_s: float | None = None  # deadline for coming to rest, and then for standing still
+    measure_at_s: float = 0.0  # end of the measuring time
+    is_requested: bool = False  # a measurement is requested and still wanted
+    is_repeated: bool = False  # the measurement failed: request it again after another measuring time
 
     def settle(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "Settling":
-        """One frame of coming to rest; over when ``standstill.is_rest``, and the measuring time begins."""
+        """One frame of coming to rest. It ends with ``standstill.is_rest``; then the measuring time begins."""
         standstill = self.standstill.update(cfg, motion)
         rest_by_s = motion.t_s + SETTLE_LIMIT_S if self.rest_by_s is None else self.rest_by_s
         settling = replace(self, standstill=standstill, rest_by_s=rest_by_s)
         return settling._timed(motion.t_s, measuring_time_s) if standstill.is_rest else settling
 
     def measure(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "tuple[Settling, bool]":
-        """One frame of the measuring time, which motion begins again; whether to ask for the measurement now."""
+        """One frame of the measuring time, which any motion restarts; and whether to request the measurement now."""
         t_s = motion.t_s
         settling = replace(self, standstill=self.standstill.update(cfg, motion))
         if settling.is_repeated:
@@ -95,12 +95,12 @@ class Settling(msgspec.Struct, frozen=True, tag=True):
         return replace(self, measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S, rest_by_s=t_s + SETTLE_LIMIT_S)
 
     def is_overdue(self, t_s: float) -> bool:
-        """Coming to rest, or standing still for a measurement, takes far longer than it should."""
+        """Whether the deadline for coming to rest, or for standing still, has passed."""
         return self.rest_by_s is not None and t_s > self.rest_by_s
 
 
 class ReturnHome(msgspec.Struct, frozen=True, tag=True):
-    """The way along ``stops`` to base, the last; ``stop_index`` is behind that once the robot stands there."""
+    """The way home along ``stops``, of which the last is base; ``stop_index`` is past the last at the end."""
 
     stops: tuple[Stop, ...]
     stop_index: int = 0
@@ -110,11 +110,11 @@ class ReturnHome(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def is_at_base(self) -> bool:
-        """The robot stands at base, turned as it should be."""
+        """Whether the robot stands at base, with the heading of base."""
         return self.stop_index >= len(self.stops)
 
     def interrupted(self) -> "ReturnHome":
-        """The leg begins again, from wherever the robot is then."""
+        """The same, but the leg begins again from where the robot will be."""
         return replace(self, leg=None, is_docking=False)
 
     def update(
@@ -143,14 +143,14 @@ class ReturnHome(msgspec.Struct, frozen=True, tag=True):
         return self, STILL
 
 
-# A turn that met the rim is undone by at most this; more would sweep the next corner.
+# Limit for undoing a turn that led to the rim: a larger turn would bring the next corner over the rim.
 UNTURN_LIMIT_RAD = 0.8
-# 60 mm at 0.05 m/s and a turn take three seconds: after this long a wheel is blocked, or nothing is permitted.
+# A retreat of 60 mm at 0.05 m/s and a turn take 3 s. After this time a wheel is blocked or no motion is permitted.
 TIME_LIMIT_S = 15.0
 
 
 class RetreatStep(StrEnum):
-    """What the retreat is at."""
+    """Steps of a retreat."""
 
     BACK = "back"
     UNTURN = "unturn"
@@ -160,27 +160,27 @@ class RetreatStep(StrEnum):
 
 
 class Retreat(msgspec.Struct, frozen=True, tag=True):
-    """One back-off along the track just driven, then a turn away from the side that hung over.
+    """Backs off along the track just driven, then turns away from the side that hung over the edge.
 
-    A robot that met the edge backwards faces away from it, and does not turn.
+    A robot that reached the edge in reverse does not turn, because it faces away from the edge.
     """
 
     step: RetreatStep
     last: PanelPose  # in the last frame
-    away_rad: float  # the turn away, to the side that stands on the mirror; where both or none do, to the left
-    direction: float  # in which it backs off, 1 forward
+    away_rad: float  # turn away, towards the side that is on the mirror; to the left if both or neither are
+    direction: float  # of the back-off, 1: forward, -1: reverse
     after_back: RetreatStep
-    unturn: float  # sense in which a turn is undone
+    unturn: float  # sign of the turn that undoes the last one
     time_s: float = 0.0
     travel_m: float = 0.0
     turned_rad: float = 0.0
     has_turned_away: bool = False
-    turn: LegMotion | None = None  # the turn away under way
-    goal_rad: float = 0.0  # the heading in which it ends
+    turn: LegMotion | None = None  # the turn away, once it has begun
+    goal_rad: float = 0.0  # heading at the end of the turn away
 
     @classmethod
     def begin(cls, cfg: MissionConfig, verdict: Verdict, pose: PanelPose, rate_rad_s: float) -> "Retreat":
-        """The retreat from what a verdict reports."""
+        """The retreat from the edge that a verdict reports."""
         front_left, front_right, rear_left, rear_right = verdict.off
         front, rear = front_left or front_right, rear_left or rear_right
         left, right = front_left or rear_left, front_right or rear_right
@@ -211,7 +211,7 @@ class Retreat(msgspec.Struct, frozen=True, tag=True):
             step = RetreatStep.STUCK
         now = replace(self, last=pose, travel_m=travel_m, turned_rad=turned_rad, time_s=time_s, step=step)
         if not (verdict.forward or verdict.reverse or verdict.turn):
-            return now, STILL  # data are missing, which passes by itself
+            return now, STILL  # data are missing; this ends by itself
         is_clear = verdict.code is not EventCode.NEAR_EDGE
         if step is RetreatStep.BACK:
             return now._back(cfg, is_clear, verdict)
@@ -222,7 +222,7 @@ class Retreat(msgspec.Struct, frozen=True, tag=True):
         return now, STILL
 
     def at(self, step: RetreatStep) -> "Retreat":
-        """The same at another step."""
+        """The same retreat at another step."""
         return replace(self, step=step)
 
     def _back(self, cfg: MissionConfig, is_clear: bool, verdict: Verdict) -> "tuple[Retreat, Twist]":
@@ -243,7 +243,8 @@ class Retreat(msgspec.Struct, frozen=True, tag=True):
         self, tracker: LegTracker, motion: StateEstimate, is_clear: bool, verdict: Verdict, is_slow: bool
     ) -> "tuple[Retreat, Twist]":
         if not is_clear:
-            # The turn sweeps a corner off the panels. Off the rim, back; off what may be a seam, the fix decides.
+            # The turn moved a corner sensor off the panels. At the rim, undo the turn; where it may be a seam, a fix
+            # decides.
             step = RetreatStep.UNTURN if verdict.cause.startswith(RIM_AHEAD.message) else RetreatStep.OVER
             unturn = -copysign(1.0, self.away_rad)
             return replace(self, step=step, has_turned_away=True, unturn=unturn, turned_rad=0.0), STILL

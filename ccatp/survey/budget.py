@@ -1,4 +1,4 @@
-"""The time budget of a survey: what is left to do against what is left of the time."""
+"""The time budget of a survey: compares the remaining work with the remaining time."""
 
 from collections.abc import Callable, Sequence
 from math import hypot, pi
@@ -9,24 +9,24 @@ from ccatp.core import DeckPose, PointId
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.search import leg_time, turn_time
 
-# Points of a panel that are measured when not all can be: corners and centre, then three that determine a plane.
+# Points of a panel to measure when there is no time for all: corners and centre, or three that determine a plane.
 LEVELS = (frozenset((1, 3, 5, 7, 9)), frozenset((1, 3, 8)))
-_TURN_RAD = 0.5 * pi  # taken before every leg
-_DETOUR = 1.5  # the way home around the rim's steps against the straight line
+_TURN_RAD = 0.5 * pi  # assumed before every leg
+_DETOUR = 1.5  # length of the way home, around the rim's steps, over the straight line
 _DOCKING_S = 15.0  # escape from the rim, turns on the way, the turn at base
-_FIRST_S = 60.0  # planned motion before the pace is known
+_FIRST_S = 60.0  # planned time after which the ratio of real to planned time is known
 _LARGEST_PACE = 5.0
 
 
 def home_time_s(base: DeckPose, limits: LimitsConfig, x_m: float, y_m: float) -> float:
-    """An upper estimate of the way to ``base`` from a place on the deck, s; no way is planned for it."""
+    """Upper estimate of the time from a place on the deck to ``base``, s, without planning a route."""
     length_m = _DETOUR * hypot(x_m - base.x_m, y_m - base.y_m)
     stops = 1 + int(length_m)
     return leg_time(length_m, limits) + stops * turn_time(_TURN_RAD, limits) + _DOCKING_S
 
 
 class BudgetProgress(NamedTuple):
-    """Begin (robot time), planned time of what was done and of what comes next; time in other processes before, s."""
+    """Start (robot time), planned times of the work done and of the next point, time in earlier processes, s."""
 
     begun_s: float | None = None
     planned_s: float = 0.0
@@ -35,7 +35,7 @@ class BudgetProgress(NamedTuple):
 
 
 class TimeBudget:
-    """Compares what is left to do with what is left of ``budget_s``, first frame until home or complete."""
+    """Compares the remaining work with the rest of ``budget_s``, from the first frame until home or complete."""
 
     def __init__(self, budget_s: float, mirror: Mirror, limits: LimitsConfig, measuring_time_s: float) -> None:
         self.budget_s = budget_s
@@ -57,14 +57,14 @@ class TimeBudget:
         return total_s
 
     def progress(self, before: BudgetProgress, pose: DeckPose, left: Sequence[PointId]) -> BudgetProgress:
-        """After a point: the progress, with the ``left`` points to do."""
+        """The progress after a point; ``left``: remaining points."""
         next_s = self.tour_s(pose.x_m, pose.y_m, left[:1])
         return before._replace(planned_s=before.planned_s + before.next_s, next_s=next_s)
 
     def review(
         self, progress: BudgetProgress, t_s: float, pose: DeckPose, left: Sequence[PointId]
     ) -> Sequence[PointId] | None:
-        """Those of the ``left`` points to go on with (``left`` itself: all); None to go home now."""
+        """The remaining points that there is time for: ``left`` itself if all, None to go home now."""
         elapsed_s = progress.before_s + t_s - (progress.begun_s if progress.begun_s is not None else t_s)
         late = elapsed_s / progress.planned_s if progress.planned_s > _FIRST_S else 1.0
         pace = min(max(late, 1.0), _LARGEST_PACE)

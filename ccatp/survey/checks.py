@@ -1,4 +1,4 @@
-"""Checks of a survey beside its frames: an unattended fault, and gravity that contradicts the mirror."""
+"""Two checks of a survey: a fault that no operator attends to, and gravity that contradicts the mirror."""
 
 from collections.abc import Sequence
 from enum import StrEnum
@@ -9,11 +9,11 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, Vector3, wrap_pi
 from ccatp.mirror.mirror import Mirror
 
-_EARLY = 1.05  # from the decision to the first turn of a wheel some charge goes, too
+_EARLY = 1.05  # factor for the charge used between the decision and the start of the motion
 
 
 class FaultAction(StrEnum):
-    """What the timer asks for."""
+    """What the timer requests."""
 
     NOTHING = ""
     REMIND = "remind"
@@ -21,9 +21,9 @@ class FaultAction(StrEnum):
 
 
 class UnattendedFaultTimer:
-    """A reminder while no operator resumes a faulted robot, and home before the battery no longer lasts for it.
+    """Reminds operators of a faulted robot, and sends it home before the battery is too low for that.
 
-    ``falls``: without fans the robot falls off this mirror; only there it is worth moving without an operator.
+    ``falls``: without fans the robot falls off this mirror. Only there it moves without an operator.
     """
 
     def __init__(self, cfg: Config, *, falls: bool) -> None:
@@ -33,18 +33,18 @@ class UnattendedFaultTimer:
         self._has_returned = False
 
     def held_s(self, t_s: float) -> float:
-        """How long the fault lasts."""
+        """Duration of the fault, s."""
         return 0.0 if self._since_s is None else t_s - self._since_s
 
     def over(self) -> None:
-        """There is no fault any more."""
+        """The fault has ended."""
         self._since_s = None
 
     def watch(self, t_s: float, soc: float, home_s: float | None) -> FaultAction:
-        """One frame of a fault; charge 0 to 1; ``home_s`` is None where the robot does not know where it is."""
+        """One frame of a fault. ``soc``: 0 to 1; ``home_s``: time of the way home, None while the pose is unknown."""
         if self._since_s is None or t_s < self._since_s:
             self._since_s, self._remind_at_s = t_s, t_s + self._alarm_period_s
-        # Once: a return that failed may have failed for the reason of the fault.
+        # Only once, because the return may fail for the reason of the fault.
         if self._falls and not self._has_returned and home_s is not None and self.is_low(soc, home_s):
             self._has_returned = True
             return FaultAction.RETURN
@@ -54,23 +54,24 @@ class UnattendedFaultTimer:
         return FaultAction.REMIND
 
     def is_low(self, soc: float, home_s: float) -> bool:
-        """Whether the charge above the reserve is less than the way home may take."""
+        """Whether the charge above the reserve is less than the way home may need."""
         needed = _EARLY * self._health.battery_margin * home_s / self._health.battery_life_s
         return not soc - self._health.battery_reserve > needed
 
 
-# A mirror that is more than 5 deg off must never pass. The median of so many readings of 2 deg each is right within 0.4
-# deg, one standard deviation; what else may differ (the start pose, the sensor's mounting) is far below the limit.
+# A mirror whose slope differs by more than 5 deg must never pass. The median of 40 readings of 2 deg each has a
+# standard deviation of 0.4 deg; errors of start pose and mounting are far below the limit.
 LIMIT_RAD = radians(3.5)
 READINGS = 40
-# What has come in after this time has to do, s; none at all: the robot has no such sensor.
+# The check uses the readings received in this time, s; without any, the robot has no such sensor.
 PATIENCE_S = 4.0
 
 
-# People set a robot down with the heading of base within some degrees; gravity itself leaves 4 deg of heading open.
+# Limit of the heading error at base: the robot is placed there within some degrees, and gravity shows the heading
+# within 4 deg.
 BEARING_RAD = radians(15.0)
-_LEAST_TILT = 0.1  # on flatter ground gravity has no direction along the surface
-# Single mistakes of a robot: what it reports as x, y and z instead.
+_LEAST_TILT = 0.1  # on flatter ground gravity does not show a heading
+# Possible mistakes of a robot in its report of gravity: what it reports as x, y and z.
 _MISTAKES = {
     "gravity points the other way: the robot reports the reaction (up) instead of the direction of fall": "-x -y -z",
     "gravity is mirrored: x has the wrong sign": "-x y z",
@@ -90,9 +91,9 @@ _MISTAKES = {
 class MirrorCheck:
     """Before the first motion: does gravity agree with the slope of the configured mirror?
 
-    The heading plays a part only with ``is_heading_known``. ``contradiction``: why the mirror cannot be this one, or
-    the mistake of the robot that explains what it reports, or empty; ``warning``: what could not be checked;
-    ``unseen``: mistakes that make no difference here.
+    The heading is checked only with ``is_heading_known``. ``contradiction``: why the robot is not on this mirror, or
+    the mistake in its report, or empty. ``warning``: what could not be checked. ``unseen``: mistakes that would not
+    show in this pose.
     """
 
     def __init__(self, mirror: Mirror, *, is_heading_known: bool = False) -> None:
@@ -103,7 +104,7 @@ class MirrorCheck:
         self.unseen: list[str] = []
 
     def update(self, t_s: float, gravity: Sequence[float] | None, pose: DeckPose) -> bool:
-        """Take a frame and gravity's direction in the robot frame, where it was read; whether the check is complete."""
+        """Take a frame with a gravity sample (robot frame) or ``None``; returns whether the check is complete."""
         if self._first_s is None:
             self._first_s = t_s
         if gravity is not None:
@@ -121,7 +122,7 @@ class MirrorCheck:
     def _judge(self, expected: Vector3) -> None:
         x, y, z = (median(values) for values in zip(*self._readings, strict=True))
         felt = x, y, z
-        # Readings are noisy: the slope of their median differs a little from the median of their slopes.
+        # The median of the slopes, because with noise the slope of the median differs from it.
         felt_rad, expected_rad = median(map(_slope, self._readings)), _slope(expected)
         is_slope_right = abs(felt_rad - expected_rad) <= LIMIT_RAD
         mistakes = {what: _mistaken(expected, axes) for what, axes in _MISTAKES.items()}
@@ -144,13 +145,13 @@ class MirrorCheck:
 
 
 def _mistaken(gravity: Vector3, axes: str) -> Vector3:
-    """Gravity as it is reported with a mistake."""
+    """Gravity as reported with a mistake; ``axes`` as in ``_MISTAKES``."""
     x, y, z = (gravity["xyz".index(axis[-1])] * (-1.0 if axis[0] == "-" else 1.0) for axis in axes.split())
     return x, y, z
 
 
 def _is_alike(felt: Vector3, gravity: Vector3) -> bool:
-    """Whether slope and, where the ground has one, direction of the slope agree."""
+    """Whether the slopes agree and, on ground that is not flat, their directions."""
     if abs(_slope(felt) - _slope(gravity)) > LIMIT_RAD:
         return False
     return hypot(gravity[0], gravity[1]) < _LEAST_TILT or abs(_bearing(felt, gravity)) <= BEARING_RAD

@@ -1,4 +1,4 @@
-"""Assembles the parts of a main loop from a configuration and a checkpoint; a survey's plan before anything moves."""
+"""Assembles the parts of a main loop from a configuration and a checkpoint; the plan of a survey as text and data."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -26,28 +26,28 @@ from ccatp.survey.planning.tour_bound import tour_bound
 from ccatp.survey.state import SurveyState
 from ccatp.survey.statechart import Mission, Survey
 
-# The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
+# Largest difference between the configuration (calibrated) and the robot's own values (nominal).
 RADIUS_TOLERANCE = 0.05
 SENSOR_TOLERANCE_M = 0.005
-TOP_SPEED_M_S = 1.0  # interface control document 1: a robot that says more is not one
+TOP_SPEED_M_S = 1.0  # interface control document 1; a higher value cannot be right
 
-# Below this a robot that is in a standing state is at rest.
+# Speeds below which a robot in a standing mode is at rest.
 _STILL_M_S, _STILL_RAD_S = 0.002, 0.01
 _STANDING = (IDLE, SETTLING, MEASURING, HELD, MissionState.DONE)
-# Of a robot that stood: it may have crept, or been touched.
+# Standard deviations for a robot that stood: it may have crept, or somebody may have touched it.
 _STOOD_M, _STOOD_RAD = 0.005, 0.01
-# Of one that moved: the record is up to 0.1 s old, the last command lives for 0.25 s, the wheels run down in 0.1 s.
+# Unobserved motion: the checkpoint is up to 0.1 s old, the last command lasts for 0.25 s, the wheels run down in 0.1 s.
 _UNSEEN_S = 0.45
-# Within the age of the record it may have begun to move.
+# After the checkpoint the robot may have accelerated for this time.
 _BEGUN_S = 0.1
 _NO_ROUTE = Route((), (0.0,))
 
 
 class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=2, forbid_unknown_fields=True):
-    """What one main loop leaves to the next: the state of the survey, and where the robot was.
+    """What a main loop saves for the next one: the state of the survey and the pose of the robot.
 
-    Without route and measured points: the next one plans again, and finds the points in the mission's database. The tag
-    is the number of the format.
+    Route and measured points are left out: the next loop plans the route again and reads the points from the mission's
+    database. The tag is the number of the format.
     """
 
     boot: int
@@ -73,7 +73,7 @@ class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=2, forbid_unk
         boot: int = -1,
         run_id: str = "",
     ) -> "Checkpoint":
-        """That of frame ``seq``; ``boot`` is the robot's, whose clock counts from there."""
+        """The checkpoint of frame ``seq``. ``boot``: boot number of the robot, whose clock starts at each boot."""
         return cls(
             boot,
             seq,
@@ -89,7 +89,7 @@ class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=2, forbid_unk
         )
 
     def sigmas(self, limits: LimitsConfig) -> tuple[float, float]:
-        """Standard deviations of position (m) and heading (rad) of the robot, which was not observed since."""
+        """Standard deviations of position (m) and heading (rad) after a time without observation."""
         v, omega = abs(self.speed_m_s), abs(self.rate_rad_s)
         way_m = turn_rad = 0.0
         if self.state.mode not in _STANDING or v >= _STILL_M_S or omega >= _STILL_RAD_S:
@@ -100,9 +100,9 @@ class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=2, forbid_unk
 
 @dataclass(frozen=True, slots=True)
 class SurveyParts:
-    """The pure parts of a main loop, and what a summary needs to know of the plan.
+    """The pure parts of a main loop, and the values of the plan for the summary.
 
-    ``start``: pose, and its standard deviations (m, rad), of a robot that another main loop left; ``None``: at base.
+    ``start``: pose and its standard deviations (m, rad) from the checkpoint of an earlier loop; ``None``: at base.
     """
 
     cfg: Config
@@ -117,18 +117,21 @@ class SurveyParts:
     start: tuple[DeckPose, tuple[float, float]] | None = None
 
     def heading_sigma_rad(self) -> float:
-        """How well the heading is known. No drive shows the four states theirs: the fix does not reach it."""
+        """Standard deviation of the heading; 0 for the four-state localizer, whose heading a fix does not correct."""
         return 0.0 if self.cfg.run.filter in FOUR_STATE else self.localizer.heading_sigma_rad
 
     def measure_grip(self) -> bool:
-        """After a fix, by the creep of the turn before it; whether that showed it. The four states have no creep."""
+        """Measure the grip after a fix, from the creep of the turn before; returns whether there is a new value.
+
+        The four-state localizer does not estimate creep.
+        """
         localizer = self.localizer
         if not isinstance(localizer, FullStateLocalizer):
             return False
         return self.thrust.measure_grip(localizer.counts["fixes"], localizer.deck_pose, self.turn_creep_m_rad())
 
     def turn_creep_m_rad(self) -> float:
-        """Downhill, for each radian of a turn, mean of all headings; 0 of the four states."""
+        """Downhill creep per radian of a turn, mean over all headings, m; 0 for the four-state localizer."""
         localizer = self.localizer
         return float(localizer.state[0][CT]) if isinstance(localizer, FullStateLocalizer) else 0.0
 
@@ -138,13 +141,13 @@ class SurveyParts:
         return len(self.points)
 
     def check_robot(self, hello: Hello) -> None:
-        """Refuse a robot whose own geometry contradicts the configuration."""
+        """Raises ``ConfigError`` if the robot's own geometry contradicts the configuration."""
         if problems := robot_problems(self.cfg, self.mirror, hello):
             raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")
 
 
 def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint | None = None) -> SurveyParts:
-    """All pure parts, the robot at base or where ``checkpoint`` says.
+    """All pure parts; the robot is at base, or at the pose of ``checkpoint``.
 
     Raises ``PlanError``: unreachable point; ``ConfigError``: too little thrust.
     """
@@ -176,7 +179,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint
 
 
 def _slowed(cfg: Config, grip: GripForecast) -> Config:
-    """With the limits of slow motion where grip is short."""
+    """The configuration, with the limits of slow motion where there is little grip."""
     if not grip.is_short or not grip.is_held:
         return cfg
     limits, health = cfg.limits, cfg.health
@@ -186,8 +189,8 @@ def _slowed(cfg: Config, grip: GripForecast) -> Config:
 
 
 def take_over(cfg: Config, checkpoint: Checkpoint, event: TakenOver) -> SurveyParts:
-    """The parts of a main loop that goes on where another one ended. Raises as ``assemble``."""
-    # What failed, and what there was no time for, is a matter of the state.
+    """The parts of a main loop that continues where another one ended. Raises as ``assemble``."""
+    # The state knows the points that failed and those without time.
     failed = () if event.is_new_run else (*checkpoint.state.failure_causes, *event.skipped)
     parts = assemble(cfg, {*event.measured, *failed}, checkpoint)
     parts.mission.handle(event)
@@ -203,19 +206,19 @@ def plan_survey(
     *,
     calibrates: bool = True,
 ) -> Route:
-    """The route of a survey from base, with the calibration drive before it where the localizer uses one.
+    """The route of a survey from base, with the calibration drive first if the localizer uses one.
 
-    ``out_of_reach`` takes the points that cannot be reached; without it they raise ``PlanError``, as does a base that
-    is not on the mirror.
+    Points that cannot be reached are added to ``out_of_reach``; without this list they raise ``PlanError``, as does a
+    base that is not on the mirror.
     """
     planner = RoutePlanner(mirror, cfg)
     route = planner.route(mirror.base_pose, points, done, out_of_reach)
-    # The four states have none that the drive could calibrate.
+    # The four-state localizer has no parameters to calibrate.
     return planner.with_calibration(route) if calibrates and cfg.run.filter not in FOUR_STATE else route
 
 
 def robot_problems(cfg: Config, mirror: Mirror, hello: Hello) -> list[str]:
-    """In what the robot's own geometry contradicts the configuration; empty where it does not."""
+    """The contradictions between the robot's own geometry and the configuration."""
     robot, own = cfg.robot, hello.robot
     problems = [
         f"{name} is {ours} here and {theirs} there"
@@ -243,10 +246,10 @@ _SHOWN = 10
 
 @dataclass(frozen=True, slots=True)
 class SurveyPlan:
-    """What a survey would do: points in the order of measuring, those out of reach included, and stops.
+    """The plan of a survey: points in the order of measuring, with those out of reach, and stops.
 
-    ``times_s``: since the start, when it stands at each stop, before what it measures there. Driving, turning and
-    measuring are least times, rest to rest; their sum is the survey's lower bound.
+    ``times_s``: arrival at each stop, from the start. Driving, turning and measuring are least times, rest to rest;
+    their sum is the lower bound of the survey's time.
     """
 
     points: tuple[PointId, ...]
@@ -262,12 +265,12 @@ class SurveyPlan:
 
     @property
     def least_s(self) -> float:
-        """Lower bound of the survey's time along this way."""
+        """Lower bound of the survey's time along this route."""
         return self.driving_s + self.turning_s + self.measuring_s
 
 
 def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
-    """Plan a survey as a run would; raises ``PlanError`` where base is not on the mirror or a dead end."""
+    """Plan a survey as a run would; raises ``PlanError`` if base is not on the mirror or is a dead end."""
     grip = forecast_grip(cfg.robot, mirror)
     cfg = _slowed(cfg, grip)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
@@ -336,7 +339,7 @@ def plan_data(cfg: Config, plan: SurveyPlan) -> dict[str, Any]:
 
 
 def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
-    """The plan for a terminal."""
+    """The plan as lines for a terminal."""
     vias = sum(stop.kind is StopKind.VIA for stop in plan.stops)
     panels = [panel for panel, _ in groupby(point.panel for point in plan.points)]
     limits = _slowed(cfg, plan.grip).limits

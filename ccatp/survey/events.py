@@ -1,4 +1,4 @@
-"""What a mission is at and what may happen to it: modes, events, transitions; what comes between two frames."""
+"""Modes of a mission, events, the table of transitions, and the inputs that arrive between two frames."""
 
 from enum import StrEnum
 from types import MappingProxyType
@@ -9,7 +9,7 @@ from ccatp.core import PointId
 
 
 class MissionState(StrEnum):
-    """What the mission is at."""
+    """Mode of a mission."""
 
     IDLE = "idle"
     TURNING = "turning"
@@ -20,7 +20,7 @@ class MissionState(StrEnum):
     RETURNING = "returning"
     HELD = "held"
     DONE = "done"
-    # Among beacons:
+    # Only in beacon missions:
     MAPPING = "mapping"  # stands while motes map themselves
     VISITING = "visiting"  # on the way to a waypoint
     FOLLOWING = "following"  # behind the target
@@ -31,22 +31,22 @@ MAPPING, VISITING, FOLLOWING = AMONG_BEACONS
 
 
 class MissionEvent(StrEnum):
-    """What can happen to it. Every event has a meaning in every state; where the table is silent it changes nothing."""
+    """Events of a mission. An event that the table does not list for a mode has no effect."""
 
-    GO_ON = "go on"  # the survey starts, or goes on to the next leg
+    GO_ON = "go on"  # the survey starts, or continues with the next leg
     TURNED = "turned"  # the robot points at the stop
-    REALIGN = "realign"  # it does not any more
+    REALIGN = "realign"  # the robot no longer points at the stop
     ARRIVED = "arrived"  # the stop is reached
     SETTLED = "settled"  # the robot is at rest there
     EDGE = "edge"  # code 1: near the mirror's edge
     GO_HOME = "go home"  # code 2, or the operator's abort
-    FIND = "find"  # stand still for a fix: the pose is not to be trusted
+    FIND = "find"  # stand still for a fix, because the pose is not trusted
     HOLD = "hold"  # pause, fault, or no permission to move
     FINISHED = "finished"  # all points done, at base after an abort, or stopped
 
 
 class SurveyOutcome(StrEnum):
-    """How a mission ended."""
+    """Outcome of a mission."""
 
     NONE = ""
     COMPLETE = "complete"
@@ -60,7 +60,7 @@ _SURVEYING = _ANYWHERE | {
     MissionEvent.GO_HOME: RETURNING,
     MissionEvent.GO_ON: TURNING,
 }
-# (state, event) -> state. An edge outranks an abort: while backing off GO_HOME changes nothing. DONE is final.
+# (state, event) -> state. An edge precedes an abort: while backing off, GO_HOME has no effect. DONE is final.
 TRANSITIONS = MappingProxyType(
     {
         IDLE: _SURVEYING | {MissionEvent.FIND: SETTLING},
@@ -75,7 +75,7 @@ TRANSITIONS = MappingProxyType(
         **dict.fromkeys(AMONG_BEACONS, _ANYWHERE),
     }
 )
-# What the last gate lets a state of a survey move for.
+# The purpose for which the drive gate permits motion in a mode of a survey.
 PURPOSES = MappingProxyType(
     {
         IDLE: Purpose.STAND,
@@ -103,7 +103,7 @@ class Pause(NamedTuple):
 
 
 class Resume(NamedTuple):
-    """Go on after a hold; what holds the robot must be gone."""
+    """Continue after a hold whose cause is gone."""
 
 
 class Abort(NamedTuple):
@@ -130,25 +130,25 @@ class Fault(NamedTuple):
 
 
 class EstimateDiverged(NamedTuple):
-    """The localizer is frozen until it has a fix; what comes again and again is a fault."""
+    """The localizer is frozen until it has a fix. Repeated divergence is a fault."""
 
     cause: str
     t_s: float
 
 
 class TrackingGap(NamedTuple):
-    """The robot may have moved while it was not observed: it does not drive on before a fix, and a sure heading."""
+    """The robot may have moved unobserved: it needs a fix and a certain heading before it drives on."""
 
 
 class EmergencyKnown(NamedTuple):
-    """An emergency that is latched when the first verdict comes is not new."""
+    """An emergency that the first verdict reports is not new."""
 
 
 class TakenOver(NamedTuple):
-    """Go on with a state that another process left; before the first frame. The robot is found before it moves.
+    """Continue with the state of an earlier process, before the first frame; the robot relocalizes before it moves.
 
-    ``measured``, in this order, and ``skipped`` as the mission's database has them; ``elapsed_s``: mission time so far.
-    ``is_new_run``: an operator goes on with what had ended: what failed is tried again, and time counts from here.
+    ``measured``, in this order, and ``skipped`` are from the mission's database; ``elapsed_s``: mission time so far.
+    ``is_new_run``: an operator continues an ended mission; failed points are tried again, and time counts from now.
     """
 
     measured: tuple[PointId, ...]
@@ -158,18 +158,18 @@ class TakenOver(NamedTuple):
 
 
 class FixStored(NamedTuple):
-    """The measurement that was asked for is taken, fused and stored; ``None``: it only serves to find the robot."""
+    """The requested measurement is fused and stored. ``point`` is ``None`` for a fix that only relocalizes."""
 
     point: PointId | None
     heading_sigma_rad: float = 0.0
 
 
 class PointMissed(NamedTuple):
-    """The fix shows the robot too far from its point, which has to be approached again from where it really is."""
+    """The fix shows the robot too far from its point: approach the point again."""
 
 
 class FixFailed(NamedTuple):
-    """The measurement failed for good: the point is skipped; several in a row hold the robot."""
+    """The measurement failed after all retries: the point is skipped. Several failures in a row hold the robot."""
 
     point: PointId | None
     cause: str

@@ -1,6 +1,6 @@
-"""What slows, pauses, holds, returns or stops a mission: rows of every kind of mission, and the table of a survey.
+"""Reactions of a mission to verdicts: the rows common to all missions, and the table of a survey.
 
-The first row that applies decides; a row whose action lets the mission go on is followed by the rows after it.
+Rows are tried in order. A row's reaction either ends the frame or leaves it to the rows after it.
 """
 
 from typing import TYPE_CHECKING
@@ -34,7 +34,7 @@ CORNERS = frozenset(Corner)
 
 
 def is_denied(v: Verdict) -> bool:
-    """No motion is permitted."""
+    """Whether no motion is permitted."""
     return not (v.forward or v.reverse or v.turn)
 
 
@@ -42,13 +42,13 @@ def is_denied(v: Verdict) -> bool:
 
 
 def _stand_in_earthquake(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
-    """Nothing moves while the ground shakes; home when it is over, and a pose from before is not to be trusted then."""
+    """No motion in an earthquake. Afterwards the robot relocalizes, because it may have slipped, and drives home."""
     s = replace(s, emergency_epoch=v.raised)
     if not s.interlock and s.mode is not DONE:
         why = EARTHQUAKE.message
         s = rules.lose_pose(replace(s, interlock=why, abort_cause=s.abort_cause or why))
         s = rules.hold(s, why, by_hand=s.is_held_by_hand)
-    # A fault has to be looked after by an operator, too.
+    # A fault is left to its own row, because it also needs an operator.
     return s, v.severity is not FAULT
 
 
@@ -63,15 +63,15 @@ def _hold(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, boo
 
 
 def pause(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
-    """Hold until it is over."""
-    # A robot that stands to be found needs no permission, and without a pose gets none before it is.
+    """Hold until the cause is gone."""
+    # A robot that stands for a fix needs no permit, and may not get one before the fix.
     if s.stands_for_fix and v is not NO_FRESH_VERDICT:
         return s, True
     return rules.interrupt(s, v.cause), True
 
 
 def _go_home(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
-    """Once for each emergency: the level is repeated in each verdict."""
+    """Abort once for each emergency, which every verdict repeats."""
     return rules.abort(replace(s, emergency_epoch=v.raised), v.cause), False
 
 
@@ -103,7 +103,7 @@ Reaction = tuple[SurveyState, bool]  # the state, and whether that is all for th
 
 
 def _locate(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict) -> Reaction:
-    """A sensor that stays off may be over a seam or the rim where the pose is wrong: one fix, at rest, decides."""
+    """Take one fix at rest: if the pose is wrong, a sensor that stays off may be over a seam or the rim."""
     if s.mode is DONE or s.is_held_by_hand:
         return s, False
     if not s.has_looked:
@@ -113,7 +113,7 @@ def _locate(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict
 
 
 def _slow(_survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict) -> Reaction:
-    """Drive at the reduced speed from now on, or at the usual one from the next leg on."""
+    """Reduce the speed now, or return to the usual speed with the next leg."""
     s = replace(s, is_slow=v.severity in REDUCED)
     if s.is_slow and s.mode in (DRIVING, TURNING) and s.fix is FixNeed.NONE:
         s = replace(s, behaviour=None)
@@ -123,12 +123,12 @@ def _slow(_survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict)
 
 
 def _return(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict) -> Reaction:
-    """Once for each finding: it is repeated in each verdict."""
+    """Abort once for each finding, which every verdict repeats."""
     return survey.abort(replace(s, finding=v.cause), v.cause), False
 
 
 def _wait_at_edge(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict) -> Reaction:
-    """After a retreat that led nowhere."""
+    """Wait after a retreat that did not leave the edge; a fault after ``hold_limit_s``."""
     is_over = s.mode is not HELD or s.hold.by_hand or (v.code is not NEAR_EDGE and v is not NO_FRESH_VERDICT)
     if s.stuck_s is None or is_over:
         return replace(s, stuck_s=None), False
@@ -141,8 +141,8 @@ def _retreat(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict
     if s.mode in (BACKING_OFF, DONE):
         return s, True
     if s.rejects_odometry:
-        s = survey.proceed(s)  # where the edge is, is not known before a fix; standing still for it is safe anywhere
-    # It stands, and a rim on the map is a matter of the pose that is being found.
+        s = survey.proceed(s)  # stand for a fix, which is always safe: without it the place of the edge is unknown
+    # The robot stands. If the map has the rim there, the pose may be wrong, and a fix is on its way.
     if s.stands_for_fix or s.is_held_by_hand or motion.t_s < s.stands_until_s:
         return s, True
     mission, backoffs = survey.cfg.mission, s.backoffs + 1
@@ -151,11 +151,11 @@ def _retreat(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict
     s = replace(
         s,
         backoffs=backoffs,
-        # Back at an edge right after a fix of the place: then it is the heading that is wrong.
+        # At an edge again after a fix of the position: the heading must be wrong.
         inflates_covariance=s.inflates_covariance or backoffs > 1,
         cause=v.cause,
         is_missed=False,
-        # An edge that the route did not foresee means that the pose is wrong: it is found again before moving on.
+        # The route avoids edges, so the pose is wrong: relocalize before moving on.
         fix=FixNeed.RELOCALIZE,
         behaviour=Retreat.begin(mission, v, motion.pose, motion.rate_rad_s),
     )

@@ -1,8 +1,8 @@
-"""Checks of a fix before it is used: frame and unit of the laser system, on the surface, repeated where it is doubted.
+"""Checks of a fix before it is used: frame and unit of the laser system, place on the surface, agreement of fixes.
 
-The collimators' surveyed places may be written down with other axes, handedness or unit than the mirror's; the lengths
-may come in another unit. The lengths then fit all the same, or a place far off. So the first fixes are compared with
-where the robot must be, and what does not fit is explained, as far as one mistake explains it.
+The positions of the collimators may be recorded with other axes, handedness or unit than the mirror's, and the lengths
+may have another unit. The lengths may then still be consistent, or give a position far away. So the first fixes are
+compared with the expected position. If they differ, the check searches for a single mistake that explains it.
 """
 
 from collections.abc import Mapping
@@ -20,12 +20,12 @@ from ccatp.localizer import FOUR_STATE
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 
-_CONSISTENT = 3  # so many fixes that agree are right against any estimate
-_FAR = 4.0  # where the localizer has no gate of its own, this many times the limit asks for them
+_CONSISTENT = 3  # this many agreeing fixes are used against any estimate
+_FAR = 4.0  # multiple of the limit beyond which they are needed, if the localizer has no gate of its own
 
 
 def nis_of(foot: DeckFoot, pose: DeckPose, covariance: FloatArray) -> float:
-    """Normalised innovation squared of a fix against an estimate, two degrees of freedom; NaN where there is none."""
+    """Normalised innovation squared of a fix, two degrees of freedom; NaN if the covariance is not finite."""
     residual = np.array((foot.x_m - pose.x_m, foot.y_m - pose.y_m))
     spread = covariance[:2, :2] + foot.covariance_m2
     if not np.isfinite(spread).all():
@@ -35,11 +35,11 @@ def nis_of(foot: DeckFoot, pose: DeckPose, covariance: FloatArray) -> float:
 
 AXES = "xyz"
 UNITS = (("mm for m", 1e-3), ("m for mm", 1e3), ("inches for mm", 25.4), ("mm for inches", 1.0 / 25.4))
-_ENOUGH = 3  # places that do not lie on a line determine a frame
-_AREA_M2 = 1e-3  # of their triangle: 0.2 m and 10 mm
+_ENOUGH = 3  # number of places, not on a line, that determine a frame
+_AREA_M2 = 1e-3  # least size of their triangle: 0.2 m and 10 mm
 
 
-# All 48 matrices that exchange and turn round axes, each (3, 3); the first is the identity.
+# All 48 matrices that permute and reverse axes, each (3, 3); the first is the identity.
 SIGNED_AXES: tuple[FloatArray, ...] = tuple(
     np.eye(3)[list(order)] * np.array(signs)[:, None]
     for order in permutations(range(3))
@@ -49,7 +49,7 @@ _UNEXPLAINED = "no exchange of axes or units explains it; is it at base, and is 
 
 
 class FrameCheck:
-    """Looks at the first fixes of a mission, until they have shown enough."""
+    """Compares the first fixes of a mission with the expected positions, until they determine the frame."""
 
     def __init__(self, cfg: EtalonConfig) -> None:
         self._limit_m = cfg.start_distance_m
@@ -57,7 +57,7 @@ class FrameCheck:
         self.is_over = False
 
     def look(self, measured_m: Vector3, expected_m: Vector3) -> str | None:
-        """The mistake that explains what is wrong with a fix, world frame, or empty; ``None``: nothing is."""
+        """``None`` if a fix is right; else the mistake that explains it, or empty. Positions in the world frame."""
         if self.is_over:
             return None
         if not dist(measured_m, expected_m) <= self._limit_m:
@@ -74,7 +74,7 @@ def _spans_a_plane(places: list[FloatArray]) -> bool:
 
 
 def explain(measured_m: Vector3, expected_m: Vector3, limit_m: float) -> str:
-    """The mistake in axes or unit that turns one position into the other; empty where none does."""
+    """The mistake in axes or unit that changes the expected position into the measured one, or empty."""
     measured, expected = np.array(measured_m), np.array(expected_m)
     for name, factor in UNITS:
         if np.linalg.norm(factor * measured - expected) <= limit_m:
@@ -89,7 +89,7 @@ def explain(measured_m: Vector3, expected_m: Vector3, limit_m: float) -> str:
 def explain_lengths(
     cfg: EtalonConfig, expected_m: Vector3, lengths_m: Mapping[int, float], collimators_m: Mapping[int, FloatArray]
 ) -> str:
-    """The mistake in axes or unit by which lengths give no position near the expected one (world frame), or empty."""
+    """The mistake in axes or unit without which the lengths give the expected position (world frame), or empty."""
     for name, factor in UNITS:
         scaled = {channel: factor * length for channel, length in lengths_m.items()}
         if _fits(cfg, expected_m, scaled, collimators_m):
@@ -121,10 +121,10 @@ def _name(matrix: FloatArray) -> str:
 
 
 class FixFinding(NamedTuple):
-    """What was found: nothing where both are empty.
+    """Result of a check; both texts are empty for a good fix.
 
-    ``doubt``: why to measure again instead of using the fix; ``refusal``: why this laser system must not be used for
-    this mission.
+    ``doubt``: why to measure again instead of using the fix; ``refusal``: why this mission must not use this laser
+    system.
     """
 
     doubt: str = ""
@@ -132,11 +132,11 @@ class FixFinding(NamedTuple):
 
 
 class FixGate:
-    """Looks at every fix of a mission before the localizer gets it.
+    """Checks every fix of a mission before the localizer gets it.
 
-    A fix off the surface is never used. One that contradicts the estimate is used once another of the same standstill
-    agrees with it; one that contradicts it beyond the localizer's own gate once two others do. A localizer that has
-    such a gate keeps that count itself.
+    A fix off the surface is never used. A fix that contradicts the estimate is used when another one of the same
+    standstill agrees with it; far from the estimate, two others must agree. A localizer with its own gate does this
+    last count itself.
     """
 
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
@@ -148,13 +148,13 @@ class FixGate:
         self._seen: list[Vector3] = []
 
     def begin(self) -> None:
-        """The robot stands again: what was measured before says nothing about here."""
+        """Begin a new standstill: drop the fixes of the last one."""
         self._seen.clear()
 
     def review(
         self, fix: Fix, expected_m: Vector3, pose: DeckPose, covariance: FloatArray, *, is_lost: bool = False
     ) -> FixFinding:
-        """Judge a fix by the expected puck, world frame, and by the pose with its covariance, (3, 3)."""
+        """Check a fix against the expected puck (world frame) and against the pose with its covariance, (3, 3)."""
         is_first, self._is_first = self._is_first, False
         why = None if is_lost else self._frame.look(fix.position_m, expected_m)
         if why is not None and (is_first or why):
@@ -175,7 +175,7 @@ class FixGate:
         agreeing = 1 + sum(dist(fix.position_m, other) <= cfg.repeat_m for other in self._seen)
         self._seen.append(fix.position_m)
         nis = nis_of(foot, pose, covariance)
-        # A localizer that is frozen has no estimate to contradict.
+        # A frozen localizer has no estimate: the NIS is not finite.
         if not isfinite(nis) or nis <= cfg.doubt_nis:
             return ""
         if self._gate_nis is not None and nis > self._gate_nis:
@@ -186,23 +186,23 @@ class FixGate:
         return f"it is {1e3 * hypot(foot.x_m - pose.x_m, foot.y_m - pose.y_m):.1f} mm from the estimate (NIS {nis:.3g})"
 
     def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> str:
-        """Why lengths that gave no position speak against the laser system; empty once a fix has been right."""
+        """Why the laser system is refused when lengths gave no position; empty after the first fix."""
         if not self._is_first:
             return ""
         why = explain_lengths(self._cfg, expected_m, lengths_m, self._collimators_m)
         return LENGTHS_REFUSED.text(why=why) if why else ""
 
 
-# A puck is within the tolerance when it is so by more than the fix may be wrong (guard band, ISO 14253-1); but a laser
-# system of little precision cannot make a robot approach a point again and again.
+# Guard band (ISO 14253-1): the tolerance is reduced by the uncertainty of the fix. It is limited, so that an imprecise
+# laser system does not make the robot approach a point again and again.
 _GUARD_SIGMAS = 3.0
 _MOST_GUARD = 0.1  # of the tolerance
 
 
 class ApproachCounter:
-    """Decides on a correction move after each fix that is further than ``tolerance_m`` from its point.
+    """Decides whether to correct the position after a fix further than ``tolerance_m`` from its point.
 
-    After ``limit`` approaches a point is measured wherever the robot stands.
+    After ``limit`` approaches the point is measured where the robot stands.
     """
 
     def __init__(self, tolerance_m: float, limit: int) -> None:
@@ -211,7 +211,7 @@ class ApproachCounter:
         self.count = 0
 
     def is_too_far(self, point: PointId, error_m: float, sigma_m: float) -> bool:
-        """Whether to approach a point again; call once a fix. ``sigma_m``: of the place, in its worst direction."""
+        """Whether to approach a point again; call once per fix. ``sigma_m``: position, in its worst direction."""
         self.count = self.count + 1 if point == self._point else 1
         self._point = point
         guard_m = min(_GUARD_SIGMAS * sigma_m, _MOST_GUARD * self._tolerance_m)

@@ -1,4 +1,4 @@
-"""The leg being driven (thesis 3.2), at the usual or the reduced speed; corrections, and legs that show the heading."""
+"""Drives a leg (thesis 3.2) at the usual or the reduced speed; plans corrections and legs that show the heading."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,20 +17,20 @@ from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, Predicted, Stop
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import build_body, course_of_heading, room_m, sensor_depths
 
-# A sensor at 0.13 m sweeps 2 mm in a hundredth of a turn's radian; between two such steps it is 0.03 mm further out.
+# Step in which a turn is checked. Between two steps a sensor at 0.13 m is up to 0.03 mm further out than at the steps.
 _SWEEP_RAD = 0.04
-# A leg that shows the heading: in steps of so much, not shorter, within so many standard deviations of the heading to
-# either side, and where it could not turn with at least this part of the way leading away from the rim.
+# A leg that shows the heading: step of the search for room, least length, standard deviations of the heading to either
+# side, and least part of the way that leads away from the rim where the robot could not turn.
 _STEP_M = 0.01
 _SHORTEST_M = 0.04
 _SIGMAS = 2.0
 _LEAVING = 0.5
-_CREEP_STEP_RAD = 0.2  # in which the creep of a turn is summed
-_SLANT = 0.1  # of a leg's length: so far beside its line it may end
+_CREEP_STEP_RAD = 0.2  # step in which the creep of a turn is summed
+_SLANT = 0.1  # largest shift of a leg's end beside its line, as a part of its length
 
 
 class LegAim(NamedTuple):
-    """Where a correction leads, in the frame of the panel on which the robot stands, after a turn in place."""
+    """End of a correction, in the frame of the panel on which the robot stands, after a turn in place."""
 
     x_m: float
     y_m: float
@@ -41,10 +41,10 @@ class LegAim(NamedTuple):
 def plan_aim(
     pose: tuple[float, float, float], target: tuple[float, float], tolerance_m: float, margin: float
 ) -> LegAim:
-    """The least motion from (x, y, heading) that brings the robot within the tolerance of (x, y) in the same plane.
+    """The least motion from ``pose`` (x, y, heading) to within the tolerance of ``target`` (x, y) in the same plane.
 
-    Straight along the heading, where the part beside it is at most ``margin`` of the tolerance; else by the smaller
-    turn that points head or tail at the target.
+    It is straight along the heading if the lateral error is at most ``margin`` of the tolerance. Otherwise the robot
+    first turns its head or its tail to the target, whichever turn is smaller.
     """
     x, y, heading = pose
     dx, dy = target[0] - x, target[1] - y
@@ -59,29 +59,29 @@ def plan_aim(
 
 
 class StateEstimate(msgspec.Struct, frozen=True):
-    """What the localizer says about the present frame.
+    """The localizer's estimate for one frame.
 
-    ``creep`` is the drift (dx, dy) per metre of travel in the plane of ``pose``. ``ahead`` is where the robot will be,
-    in the same plane, when the twist decided now takes effect; ``None`` where that is at once. Whether it has arrived
-    and stands still is judged by ``pose``; it is steered by ``ahead``. ``sigma_of`` says how well the position is
-    known, in its worst direction, m. ``turn_creep_of``: downhill, for each radian of a turn, mean of all headings, m.
+    ``creep``: drift (dx, dy) per metre of travel, in the plane of ``pose``. ``ahead``: predicted state, in the same
+    plane, when the twist decided now takes effect; ``None``: at once. Steering uses ``ahead``; arrival and rest are
+    judged by ``pose``. ``sigma_of``: standard deviation of the position in its worst direction, m. ``turn_creep_of``:
+    downhill creep per radian of a turn, mean over all headings, m.
     """
 
     t_s: float
     dt_s: float
     pose: PanelPose
-    deck_of: Callable[[PanelPose], DeckPose]  # hardly ever asked for, and not cheap
+    deck_of: Callable[[PanelPose], DeckPose]  # a function, because it is seldom needed and slow
     speed_m_s: float
     rate_rad_s: float
     creep: tuple[float, float] = (0.0, 0.0)
     ahead: Predicted | None = None
-    sigma_of: Callable[[], float] = float  # hardly ever asked for either
+    sigma_of: Callable[[], float] = float  # likewise
     heading_sigma_of: Callable[[], float] = float
     turn_creep_of: Callable[[], float] = float
 
     @property
     def steered(self) -> Predicted:
-        """The state that the next twist will meet."""
+        """The state in which the next twist will take effect."""
         if self.ahead is not None:
             return self.ahead
         pose = self.pose
@@ -89,7 +89,7 @@ class StateEstimate(msgspec.Struct, frozen=True):
 
     @property
     def lead_rad(self) -> float:
-        """How far the robot will have turned until then."""
+        """Turn of the robot until the next twist takes effect."""
         return 0.0 if self.ahead is None else self.ahead.pose[2] - self.pose.heading_rad
 
     @property
@@ -99,12 +99,12 @@ class StateEstimate(msgspec.Struct, frozen=True):
 
 
 class Leg(msgspec.Struct, frozen=True, tag=True):
-    """The leg to a stop, as far as it is driven."""
+    """The leg to a stop and its progress."""
 
     stop: Stop
     motion: LegMotion | None = None  # None before the first frame of the leg
-    deadline_s: float = 0.0  # after that it takes far longer than it should
-    aim: tuple[PanelId, LegAim] | None = None  # it is a correction, as long as the robot stays on that panel
+    deadline_s: float = 0.0
+    aim: tuple[PanelId, LegAim] | None = None  # of a correction; valid while the robot stays on that panel
     target: tuple[PanelId, tuple[float, float]] | None = None  # the stop in the frame of a panel, m
 
 
@@ -113,7 +113,7 @@ def _course(start: DeckPose | Stop, stop: Stop) -> float:
 
 
 class LegFollower:
-    """Drives legs, and says which short ones are safe."""
+    """Drives legs, and plans short ones that are safe."""
 
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
         self._mirror, self._mission, self._timeout_factor = mirror, cfg.mission, cfg.control.leg_timeout_factor
@@ -129,7 +129,7 @@ class LegFollower:
         self.tracker = LegTracker(cfg.control, limits, cfg.robot.wheel_lag_s, slow)
 
     def follow(self, leg: Leg, motion: StateEstimate, *, is_slow: bool) -> tuple[Leg, Twist]:
-        """One frame of a leg: what it is then, and the twist until the next frame."""
+        """One frame of a leg: its new progress, and the twist until the next frame."""
         steered, panel, tracker = motion.ahead or motion.steered, motion.pose.panel, self.tracker
         stop, tracked, deadline_s, aim, cached = leg.stop, leg.motion, leg.deadline_s, leg.aim, leg.target
         if cached is None or cached[0] != panel:
@@ -148,10 +148,10 @@ class LegFollower:
         return Leg(stop, tracked, deadline_s, aim, cached), twist
 
     def begin(self, motion: StateEstimate, stop: Stop, after: Stop | None = None) -> Leg:
-        """The leg to a stop; one to a via point ends uphill of it by what the turn there, to the next stop, will creep.
+        """The leg to a stop. A leg to a via point ends uphill of it, to compensate the creep of the turn there.
 
-        Along its line, and beside it by a part of its length. Not by so little that the clearance of turns allows for
-        it, and not where a sensor would come too near to the rim.
+        The lateral part of this shift is limited. There is no shift if the clearance of turns covers the creep, or if
+        a sensor would come too near to the rim. ``after``: the next stop, to which the robot turns.
         """
         here, body = motion.deck, self._body
         length_m, course = hypot(stop.x_m - here.x_m, stop.y_m - here.y_m), _course(here, stop)
@@ -175,35 +175,35 @@ class LegFollower:
         return Leg(dataclasses.replace(stop, x_m=stop.x_m + dx_m, y_m=stop.y_m + dy_m))
 
     def _creep(self, stop: Stop, courses: FloatArray, mean_m: float) -> tuple[float, float]:
-        """How far a turn through courses creeps, ``mean_m`` at the mean of all headings, m; its direction, rad."""
+        """Creep of a turn through ``courses``, m, and its direction, rad; ``mean_m``: mean creep over all headings."""
         gravities = [self._mirror.gravity_in_robot(DeckPose(stop.x_m, stop.y_m, c)) for c in courses.tolist()]
         share = sum(map(self._turn_creep.share, gravities)) / len(gravities)
         return share * mean_m, float(courses[0]) + atan2(gravities[0][1], gravities[0][0])
 
     def begin_turn(self, leg: Leg, motion: StateEstimate, heading_rad: float, *, is_slow: bool) -> Leg:
-        """Begin the turn to a heading on the deck, at the end of a leg."""
+        """Begin the turn to a deck heading at the end of a leg."""
         tracked = self.tracker.begin_turn(difference(heading_rad, motion.deck.heading_rad), is_slow=is_slow)
         return replace(leg, motion=tracked, deadline_s=self.deadline_s(motion.t_s, tracked))
 
     def turn(self, leg: Leg, tracked: LegMotion, motion: StateEstimate, heading_rad: float) -> tuple[Leg, Twist]:
-        """One frame of that turn."""
+        """One frame of the turn of ``begin_turn``."""
         remaining = difference(heading_rad, motion.deck.heading_rad + motion.lead_rad)
         tracked, twist = self.tracker.step_turn(tracked, remaining, motion.dt_s, motion.steered.omega_rad_s)
         return replace(leg, motion=tracked), twist
 
     def deadline_s(self, t_s: float, tracked: LegMotion) -> float:
-        """When a motion that begins now takes far longer than its bang-bang time, robot time."""
+        """Deadline of a motion that begins now, robot time: far more than its bang-bang time."""
         return t_s + 5.0 + self._timeout_factor * tracked.planned_s
 
     def distance_m(self, stop: Stop | None, pose: PanelPose) -> float:
-        """Distance to a stop, m (0 where there is none)."""
+        """Distance to a stop, m; 0 without a stop."""
         if stop is None:
             return 0.0
         x, y = self.target_in(pose.panel, stop)
         return hypot(x - pose.x_m, y - pose.y_m)
 
     def is_at_rim(self, stop: Stop) -> bool:
-        """Whether the robot cannot turn as it likes there."""
+        """Whether a stop is so near to the rim that the robot cannot turn there freely."""
         return self._mirror.rim.signed_distance_m(stop.x_m, stop.y_m) < self._body.turning_depth_m
 
     def target_in(self, panel: PanelId, stop: Stop) -> tuple[float, float]:
@@ -212,7 +212,7 @@ class LegFollower:
         return x, y
 
     def correction(self, pose: PanelPose, target: tuple[float, float]) -> LegAim | None:
-        """The correction to a target in its panel's frame, m; ``None``: too far, or a sensor would pass the rim."""
+        """The correction to a target in the panel's frame, m; ``None``: too far, or a sensor would pass the rim."""
         cfg = self._mission
         if hypot(target[0] - pose.x_m, target[1] - pose.y_m) > cfg.correction_reach_m:
             return None
@@ -221,12 +221,12 @@ class LegFollower:
         turned = PanelPose(pose.panel, pose.x_m, pose.y_m, pose.heading_rad + aim.turn_rad)
         there = PanelPose(pose.panel, aim.x_m, aim.y_m, turned.heading_rad)
         deck_pose = self._mirror.deck_pose
-        # Between the ends of a few centimetres a sensor is never nearer to the rim than by half of them.
+        # Between the ends, a few centimetres apart, a sensor comes nearer to the rim by at most half of that.
         is_safe = self._can_turn(deck_pose(pose), aim.turn_rad) and self._can_turn(deck_pose(turned), 0.0)
         return aim if is_safe and self._can_turn(deck_pose(there), 0.0) else None
 
     def can_proceed(self, pose: DeckPose, stop: Stop) -> bool:
-        """Whether the turn towards ``stop`` from where a correction ended keeps every sensor on the mirror."""
+        """Whether the turn towards ``stop`` from the end of a correction keeps every sensor on the mirror."""
         bearing = atan2(stop.y_m - pose.y_m, stop.x_m - pose.x_m) + (pi if stop.reverse else 0.0)
         return self._can_turn(pose, difference(bearing, course_of_heading(self._mirror, pose)))
 
@@ -240,12 +240,12 @@ class LegFollower:
         return bool(depths.min() >= body.turn_clearance_m)
 
     def heading_leg(self, deck: DeckPose, sigma_rad: float, *, was_reverse: bool) -> Stop | None:
-        """The stop of a leg, straight ahead or back, that shows more of a doubtful heading; ``None``: there is no room.
+        """The stop of a straight leg, forward or reverse, that shows an uncertain heading; ``None``: there is no room.
 
-        It leads back where the last one came from; where there is less room, whichever way has more.
+        It drives in the direction opposite to the last leg, unless the other direction has more room.
         """
         course, cfg = course_of_heading(self._mirror, deck), self._mission
-        # Whatever the heading, no sensor leaves the mirror.
+        # With this clearance no sensor leaves the mirror at any heading.
         clearance_m = max(self._body.turning_depth_m, cfg.leg_clearance_m)
         legs = []
         for is_reverse in (not was_reverse, was_reverse):

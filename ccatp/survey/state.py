@@ -1,4 +1,4 @@
-"""State of a mission, one frozen value, and the rules from one state to the next that hold for every mission."""
+"""State of a mission as one frozen value, and the state transitions that all missions share."""
 
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
@@ -40,10 +40,10 @@ from ccatp.survey.route_follower import Leg
 
 
 class FixNeed(Enum):
-    """Whether a fix comes before the next move."""
+    """Whether the robot needs a fix before it moves."""
 
     NONE = "none"
-    CONFIRM = "confirm"  # at the start: the pose is not confirmed yet
+    CONFIRM = "confirm"  # the pose is not confirmed yet
     RELOCALIZE = "relocalize"  # the pose is known to be wrong
 
 
@@ -51,38 +51,38 @@ class Hold(NamedTuple):
     """How the robot is held."""
 
     by_hand: bool = False  # until an operator resumes
-    is_fault: bool = False  # an operator has to look after it
-    rejects_odometry: bool = False  # whatever wheels and inertial unit say, the robot stands
+    is_fault: bool = False  # a fault, which needs an operator
+    rejects_odometry: bool = False  # the localizer ignores wheels and inertial unit: the robot stands
 
 
 class HoldState(msgspec.Struct, frozen=True):
-    """What every mission knows at one time: what it is at, how it is held, and why; times are robot time, s."""
+    """The part of the state that all missions share: mode, hold and causes. Times are robot time, s."""
 
     mode: MissionState = IDLE
     outcome: SurveyOutcome = SurveyOutcome.NONE
     cause: str = ""
     hold: Hold = Hold()
-    abort_cause: str = ""  # why the mission was given up
-    interlock: str = ""  # why nothing may move: an earthquake
-    is_latched: bool = False  # of the newest verdict: an emergency, an earthquake, the gravest finding
-    is_shaking: bool = False
-    severity: Severity = Severity.NONE
+    abort_cause: str = ""  # why the mission was aborted
+    interlock: str = ""  # why no motion is allowed: an earthquake
+    is_latched: bool = False  # in the newest verdict: an emergency is latched
+    is_shaking: bool = False  # likewise: an earthquake
+    severity: Severity = Severity.NONE  # of the newest verdict
     is_slow: bool = False
-    full_fans: bool = False  # the robot shall be pressed on with full fans, from now on
-    has_looked: bool = False  # a sensor that stays off was looked at with a fix
-    finding: str = ""  # the cause for which the robot was sent home last
-    emergency_epoch: int | None = 0  # the newest emergency acted on; None: what the first verdict has is not new
-    stuck_s: float | None = None  # since when a retreat led nowhere
-    resumes_after_s: float = -inf  # a hold that goes on by itself lasts at least until then
+    full_fans: bool = False  # full fans from now on
+    has_looked: bool = False  # a fix was taken because a sensor stays off
+    finding: str = ""  # the cause of the last return home
+    emergency_epoch: int | None = 0  # the newest emergency acted on; None: take it from the first verdict
+    stuck_s: float | None = None  # when a retreat ended without leaving the edge
+    resumes_after_s: float = -inf  # a hold that ends by itself lasts at least until then
 
     @property
     def rejects_odometry(self) -> bool:
-        """Held because wheels or inertial unit are not to be believed."""
+        """Held because wheels or inertial unit are not trusted."""
         return self.mode is HELD and self.hold.rejects_odometry
 
     @property
     def is_faulted(self) -> bool:
-        """An operator has to look after it."""
+        """A fault holds the robot."""
         return self.hold.is_fault
 
     @property
@@ -97,54 +97,54 @@ class HoldState(msgspec.Struct, frozen=True):
 
     @property
     def stands_for_fix(self) -> bool:
-        """It stands so that a fix shows where it is."""
+        """The robot stands still for a fix that relocalizes it."""
         return False
 
     @property
     def is_recovering(self) -> bool:
-        """It leaves an edge, or has to be found, before it may go home."""
+        """The robot leaves an edge or relocalizes, which comes before going home."""
         return False
 
 
 class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
-    """All that a survey knows at one time."""
+    """The state of a survey."""
 
     route: Route
     stop_index: int = 0  # of the stop driven to, or measured at
-    behaviour: Leg | Settling | Retreat | ReturnHome | None = None  # made on entry into a mode, dropped on leaving it
+    behaviour: Leg | Settling | Retreat | ReturnHome | None = None  # created on entry into a mode, dropped on leaving
     fix: FixNeed = FixNeed.NONE
     done: tuple[PointId, ...] = ()  # points measured, in order
     skipped: tuple[PointId, ...] = ()  # points whose measurement failed
-    failure_causes: Mapping[PointId, str] = msgspec.field(default_factory=dict)  # of those not measured since
-    due: tuple[PointId, ...] = ()  # points to be measured next, in this order, away from the planned route
-    retried: frozenset[PointId] = frozenset()  # points that failed and were due once more
+    failure_causes: Mapping[PointId, str] = msgspec.field(default_factory=dict)  # only of points not measured since
+    due: tuple[PointId, ...] = ()  # points to measure next, in this order, instead of the planned route
+    retried: frozenset[PointId] = frozenset()  # failed points that have had their second try
     is_off_route: bool = False
     is_review_due: bool = False
-    inflates_covariance: bool = False  # the localizer shall widen its covariance; the next command says so once
-    wants_calibration: bool = False  # the calibration drive was given up, too far from where it leads
+    inflates_covariance: bool = False  # the next command tells the localizer to inflate its covariance
+    wants_calibration: bool = False  # the calibration drive was skipped, because the robot is too far from it
     is_missed: bool = False  # the last fix shows the robot too far from its point
     corrected: Stop | None = None  # the stop of the last correction
     corrections: int = 0
-    request: int = 0  # number of the measurement that was asked for last
+    request: int = 0  # number of the last requested measurement
     arrived_at: PointId | None = None  # the last point with an arrival
     failures: int = 0  # failed measurements in a row
-    heading_legs_left: int = 0  # of the search for the heading
+    heading_legs_left: int = 0  # legs left to determine the heading
     was_reverse: bool = True
     budget: BudgetProgress = BudgetProgress()
-    is_found: bool = False  # a fix has just found the robot
+    is_found: bool = False  # a fix has just relocalized the robot
     backoffs: int = 0
-    stands_until_s: float = -inf  # nothing moves before then
-    recoveries_s: tuple[float, ...] = ()  # when the estimate broke down lately
+    stands_until_s: float = -inf  # no motion before then
+    recoveries_s: tuple[float, ...] = ()  # times of the recent divergences of the estimate
 
     @property
     def stop(self) -> Stop | None:
-        """The stop of the route that is driven to, or measured at; ``None`` behind the last."""
+        """The stop of the route that is driven to, or measured at; ``None`` after the last."""
         stops = self.route.stops
         return stops[self.stop_index] if self.stop_index < len(stops) else None
 
     @property
     def stops(self) -> Sequence[Stop]:
-        """What is being driven along: the route, the way home, or a leg that shows the heading."""
+        """The stops being driven along: the route, the way home, or a leg that shows the heading."""
         behaviour = self.behaviour
         if isinstance(behaviour, ReturnHome):
             return behaviour.stops
@@ -159,30 +159,30 @@ class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forb
 
     @property
     def measuring_point(self) -> PointId | None:
-        """The point being measured; ``None`` for a fix that only serves to find the robot again."""
+        """The point being measured; ``None`` for a fix that only relocalizes."""
         stop = self.stop
         return None if self.fix is not FixNeed.NONE or stop is None else stop.point
 
     @property
     def purpose(self) -> Purpose:
-        """What the last gate lets the robot move for: legs that show the heading may be part of the way home."""
+        """The purpose for the drive gate. After an abort, legs that show the heading belong to the way home."""
         if self.abort_cause and self.fix is not FixNeed.NONE and self.mode in (TURNING, DRIVING):
             return Purpose.HOMEWARD
         return PURPOSES[self.mode]
 
     @property
     def is_lost(self) -> bool:
-        """The pose is known to be wrong, and is to be found again; at the start it is only to be confirmed."""
+        """The pose is known to be wrong. At the start it only has to be confirmed."""
         return self.fix is FixNeed.RELOCALIZE
 
     @property
     def stands_for_fix(self) -> bool:
-        """It stands so that a fix shows where it is."""
+        """The robot stands still for a fix that relocalizes it."""
         return self.fix is not FixNeed.NONE and self.mode in (SETTLING, MEASURING)
 
     @property
     def is_recovering(self) -> bool:
-        """It leaves an edge, or has to be found, before it may go home."""
+        """The robot leaves an edge or relocalizes, which comes before going home."""
         return self.mode is BACKING_OFF or self.fix is not FixNeed.NONE
 
     @property
@@ -198,7 +198,7 @@ class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forb
 
 
 def by_reason(causes: Mapping[PointId, str]) -> dict[str, list[str]]:
-    """Points, as people name them, by why they were left out."""
+    """Names of points ("row-column-number") by the reason why they were left out."""
     named: dict[str, list[str]] = {}
     for point, why in causes.items():
         named.setdefault(why, []).append(f"{point.row}-{point.col}-{point.point}")
@@ -208,16 +208,15 @@ def by_reason(causes: Mapping[PointId, str]) -> dict[str, list[str]]:
 NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
 NONE, HOLD, RETURN, FAULT = Severity.NONE, Severity.HOLD, Severity.RETURN, Severity.FAULT
 S = TypeVar("S", bound=HoldState)
-# In place of a verdict where none is fresh enough.
+# Used instead of a verdict when none is fresh enough.
 NO_FRESH_VERDICT = NO_VERDICT.found("verdict", 0.0, 0.0).verdict(-1, 0.0, EventCode.NORMAL)
 
 
 class Row(NamedTuple):
-    """What a mission does about a verdict: one row.
+    """One reaction of a mission to a verdict.
 
-    ``applies`` to a state and the verdict in force; ``when`` says so in words. ``react`` takes the rules, a state, the
-    frame and the verdict, and returns the state, and whether that is all for this frame; otherwise the rows below count
-    as well.
+    ``applies``: whether the row applies to a state and a verdict; ``when`` describes this. ``react``: from the rules, a
+    state, the frame and the verdict to the next state, and whether the rows below are skipped in this frame.
     """
 
     when: str
@@ -227,35 +226,31 @@ class Row(NamedTuple):
 
 
 class HoldRules(Generic[S]):
-    """From one state to the next where a mission is held, goes on, or goes home.
-
-    Attributes:
-        rows: in the order of precedence.
-    """
+    """State transitions for holding, continuing and going home. ``rows``: reactions in the order of precedence."""
 
     rows: tuple[Row, ...]
 
     # -- transitions --------------------------------------------------------------------------------------------------
 
     def apply(self, s: S, event: MissionEvent) -> S:
-        """The mode changes as the table says."""
+        """Change the mode by the table of transitions."""
         mode = next_state(s.mode, event)
         return s if mode is s.mode else replace(s, mode=mode)
 
     def hold(self, s: S, cause: str, *, by_hand: bool, is_fault: bool = False) -> S:
-        """Hold, until somebody resumes or until the cause is gone; what was begun begins again afterwards."""
+        """Hold until an operator resumes (``by_hand``) or the cause is gone."""
         return self.apply(replace(s, hold=Hold(by_hand, is_fault or s.hold.is_fault), cause=cause), MissionEvent.HOLD)
 
     def interrupt(self, s: S, cause: str) -> S:
-        """Hold until frames and verdicts are fresh again; no effect where it stands anyway."""
+        """Hold until the cause is gone; no effect in a mode in which the robot stands anyway."""
         return s if s.mode in (IDLE, HELD, DONE) else self.hold(s, cause, by_hand=False)
 
     def fault(self, s: S, cause: str, *, loses_pose: bool = False) -> S:
-        """Hold until an operator resumes, because something is wrong; without a pose, a fix comes first then."""
+        """Hold until an operator resumes, because of a fault. With ``loses_pose`` the robot relocalizes then."""
         return s if s.mode is DONE else self.hold(s, cause, by_hand=True, is_fault=True)
 
     def await_recovery(self, s: S, cause: str, *, rejects_odometry: bool = False) -> S:
-        """Hold until the cause is gone, and then find out where the robot is before moving on."""
+        """Hold until the cause is gone, then relocalize before moving on."""
         if s.mode is DONE or s.is_held_by_hand:
             return s
         rejects_odometry |= s.rejects_odometry
@@ -269,15 +264,15 @@ class HoldRules(Generic[S]):
         is_new = not s.abort_cause
         s = replace(s, abort_cause=s.abort_cause or cause)
         if s.interlock:
-            return s  # home, but not before the robot may move
+            return s  # it goes home when the interlock is released
         return self.proceed(s) if s.mode is HELD or (is_new and not s.is_recovering) else s
 
     def proceed(self, s: S) -> S:
-        """To what is next."""
+        """Change to the next task."""
         raise NotImplementedError
 
     def lose_pose(self, s: S, *, doubts_odometry: bool = True) -> S:
-        """The pose is not to be trusted, nor what odometry has made of it where that is doubted."""
+        """Mark the pose as not trusted; with ``doubts_odometry`` the localizer inflates its covariance."""
         return s
 
     # -- events between two frames ------------------------------------------------------------------------------------
@@ -303,7 +298,7 @@ class HoldRules(Generic[S]):
     # -- verdicts -----------------------------------------------------------------------------------------------------
 
     def react(self, s: S, frame: Any, verdict: Verdict | None) -> S:
-        """Do what the verdict in force demands (``None``: none fresh enough) in a frame at ``frame.t_s``."""
+        """React to the verdict in force (``None``: none is fresh enough) in a frame at ``frame.t_s``."""
         if verdict is None or not _is_routine(s, verdict):
             s = s if verdict is None else _with_levels(s, verdict)
             v = verdict or NO_FRESH_VERDICT
@@ -329,7 +324,7 @@ def _resume_refusal(s: HoldState) -> str | None:
 
 
 def _is_routine(s: HoldState, v: Verdict) -> bool:
-    """No row applies to such a verdict in such a state, and it says nothing that has to be remembered."""
+    """Whether no row applies, and nothing in the verdict has to be stored in the state."""
     is_normal = v.severity is NONE and v.code is EventCode.NORMAL and not (v.is_shaking or v.raised or v.full_fans)
     was_normal = s.severity is NONE and not (s.is_latched or s.is_shaking or s.interlock or s.has_looked or s.is_slow)
     is_known = s.emergency_epoch is not None and s.stuck_s is None
@@ -337,7 +332,7 @@ def _is_routine(s: HoldState, v: Verdict) -> bool:
 
 
 def _with_levels(s: S, v: Verdict) -> S:
-    """What the verdict says that is remembered."""
+    """Store the parts of a verdict that later frames need."""
     epoch, full_fans = s.emergency_epoch, s.full_fans or v.full_fans or v.is_shaking
     has_looked, interlock = s.has_looked and v.severity >= HOLD, s.interlock if v.is_shaking else ""
     levels = v.raised > 0, v.is_shaking, v.severity, full_fans, has_looked, interlock

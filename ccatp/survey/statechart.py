@@ -1,4 +1,4 @@
-"""The survey: from the pose, the danger loop's verdict and events to the next state and a command. Pure."""
+"""The statechart of a survey: from pose, verdict and events to the next state and a command. Pure."""
 
 from collections.abc import Sequence
 
@@ -48,29 +48,29 @@ from ccatp.survey.planning.route import Route, RoutePlanner
 from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
 from ccatp.survey.state import FixNeed, Hold, HoldRules, SurveyState
 
-# So long after a fix found the robot the danger loop has received where it is: a pose in five frames, and a verdict.
+# Time after a fix until the danger loop has judged the new pose: a pose every five frames, and a verdict.
 _NOTICED_S = 0.2
-# Planned at a time: a way through so many points takes less than the robot's frames may wait.
+# Number of points planned at once; planning a route through more would take too long within a frame.
 CHUNK = 12
-# Legs that show the heading: there and back, twice. A filter of one that was far off needs more than one look.
+# Legs that show the heading: forth and back, twice. A heading that is far off needs more than one pair.
 MOST_LEGS = 4
-# A heading that so many times the limit is wrong leads a leg of the survey astray.
+# Multiple of ``heading_doubt_rad`` beyond which the heading is determined before the next leg.
 _LOST = 2.0
 
-# What goes on unchanged in another process.
+# Fields of the state that another process keeps unchanged.
 _KEPT = (
     *("abort_cause", "full_fans", "finding", "emergency_epoch", "retried", "is_off_route", "is_review_due"),
     *("corrections", "request", "failures", "was_reverse", "backoffs"),
 )
 
 _SURE_SIGMAS = 3.0
-_LONG_TURN_S = 1.0  # 0.7 rad; the turn after a fix, to where the robot crept from, is shorter
+_LONG_TURN_S = 1.0  # 0.7 rad; a turn that only corrects the creep of the last one is shorter
 
 Step = tuple[SurveyState, MissionCommand]
 
 
 class Survey(HoldRules[SurveyState]):
-    """What does not change during a survey, and the functions from one state to the next."""
+    """The constant parts of a survey, and the transitions from one state to the next."""
 
     rows = ROWS
 
@@ -89,7 +89,7 @@ class Survey(HoldRules[SurveyState]):
         return SurveyState(route=self._route, fix=FixNeed.CONFIRM if self.cfg.mission.fix_at_start else FixNeed.NONE)
 
     def left_out(self, s: SurveyState) -> dict[PointId, str]:
-        """Points that are skipped, or that will not be measured any more, and why."""
+        """Points that were skipped, or will not be measured any more, with the reason."""
         out = dict(s.failure_causes)
         if s.mode is DONE:
             why, over = s.cause or str(s.outcome), {*s.done, *out}
@@ -99,7 +99,7 @@ class Survey(HoldRules[SurveyState]):
     # -- frames -----------------------------------------------------------------------------------------------------
 
     def step(self, s: SurveyState, motion: StateEstimate, verdict: Verdict | None) -> Step:
-        """One frame: react to the verdict in force (``None``: none fresh enough), then do what the mode says."""
+        """One frame: react to the verdict in force (``None``: none is fresh enough), then act by the mode."""
         if self._is_steered_bare:
             control = self.cfg.control
             motion = replace(
@@ -110,7 +110,7 @@ class Survey(HoldRules[SurveyState]):
         if s.budget.begun_s is None:
             s = replace(s, budget=s.budget._replace(begun_s=motion.t_s))
         if s.is_found:
-            # At an edge it stands until the danger loop reports where: what it met may have been a seam.
+            # At an edge, stand until the danger loop has judged the new pose: the edge may have been a seam.
             is_at_edge = verdict is not None and verdict.code is EventCode.NEAR_EDGE and s.fix is FixNeed.NONE
             until_s = motion.t_s + _NOTICED_S if is_at_edge else s.stands_until_s
             s = replace(s, is_found=False, stands_until_s=until_s)
@@ -134,28 +134,28 @@ class Survey(HoldRules[SurveyState]):
     # -- transitions --------------------------------------------------------------------------------------------------
 
     def hold(self, s: SurveyState, cause: str, *, by_hand: bool, is_fault: bool = False) -> SurveyState:
-        """What was begun begins again afterwards."""
+        """Hold, and drop the current behaviour, which begins again afterwards."""
         return super().hold(replace(s, behaviour=None, is_missed=False), cause, by_hand=by_hand, is_fault=is_fault)
 
     def fault(self, s: SurveyState, cause: str, *, loses_pose: bool = False) -> SurveyState:
-        """Without a pose, a fix comes first then."""
+        """Hold until an operator resumes; with ``loses_pose`` the robot relocalizes then."""
         if loses_pose and s.fix is FixNeed.NONE and s.mode is not DONE:
             s = self.lose_pose(s)
         return super().fault(s, cause)
 
     def lose_pose(self, s: SurveyState, *, doubts_odometry: bool = True) -> SurveyState:
-        """A fix comes before the next move."""
+        """Relocalize before the next move; ``doubts_odometry`` inflates the covariance."""
         return replace(s, fix=FixNeed.RELOCALIZE, inflates_covariance=s.inflates_covariance or doubts_odometry)
 
     def proceed(self, s: SurveyState) -> SurveyState:
-        """To what is next: finding the robot, home, the next stop, or the end."""
+        """Change to the next task: relocalize, go home, drive to the next stop, or finish."""
         s = replace(
             s,
             behaviour=None,
             is_missed=False,
             inflates_covariance=s.inflates_covariance or s.rejects_odometry,
             hold=s.hold._replace(is_fault=False),
-            # Wherever a hold left the robot: the route's next turn may not be safe there.
+            # After a hold the robot may be anywhere, so that the route's next turn may not be safe.
             is_off_route=s.is_off_route or s.mode is HELD,
         )
         if s.fix is not FixNeed.NONE:
@@ -170,7 +170,7 @@ class Survey(HoldRules[SurveyState]):
         return self.apply(replace(s, cause=""), MissionEvent.GO_ON)
 
     def _begin_second_round(self, s: SurveyState) -> SurveyState:
-        """What failed and was not tried again yet is due; last first, because the robot is nearer to that."""
+        """Failed points that were not tried again yet are due; the last first, because the robot is nearest to it."""
         due, retried = s.due, s.retried
         if not due:
             due = tuple(point for point in reversed(tuple(s.failure_causes)) if point not in retried)
@@ -196,7 +196,7 @@ class Survey(HoldRules[SurveyState]):
         s, command = self._follow(s, motion, stop)
         if command is not None:
             return s, command
-        # Via points lie near the rim, and the next turn needs the room the route left.
+        # Via points lie near the rim, where the turn needs the clearance that the route planned.
         is_vague = stop.kind is StopKind.VIA and motion.sigma_of() > self.cfg.mission.via_sigma_m
         if stop.is_measured or is_vague:
             return self._arrive(s, motion)
@@ -204,7 +204,7 @@ class Survey(HoldRules[SurveyState]):
         return self._travel(s, motion)
 
     def _follow(self, s: SurveyState, motion: StateEstimate, stop: Stop) -> tuple[SurveyState, MissionCommand | None]:
-        """One frame of the leg to a stop; no command where it is reached."""
+        """One frame of the leg to a stop; no command when the stop is reached."""
         leg = s.behaviour
         if not isinstance(leg, Leg):
             after = s.route.stops[s.stop_index + 1 : s.stop_index + 2] if stop is s.stop else ()
@@ -222,7 +222,7 @@ class Survey(HoldRules[SurveyState]):
         return replace(s, behaviour=leg, mode=mode), MissionCommand(twist)
 
     def _is_vague(self, leg: object, motion: StateEstimate) -> bool:
-        """A long turn makes the place uncertain, by creep: a long leg to a point, or one at the rim, needs a fix."""
+        """Whether a turn needs a fix: creep made the position uncertain, and the leg is long or ends at the rim."""
         if not isinstance(leg, Leg) or leg.stop.point is None or motion.sigma_of() <= self._vague_m:
             return False
         is_long = leg.motion is not None and leg.motion.planned_s > _LONG_TURN_S
@@ -250,7 +250,7 @@ class Survey(HoldRules[SurveyState]):
         return self._arrive(s, motion)
 
     def _correct(self, s: SurveyState, motion: StateEstimate, stop: Stop) -> SurveyState:
-        """A leg that begins where the point was missed is a correction; the one after it needs a safe turn."""
+        """Plan a correction after a missed point; after a correction, check that the next turn is safe."""
         if s.is_missed:
             panel = motion.pose.panel
             aim = self.follower.correction(motion.pose, self.follower.target_in(panel, stop))
@@ -267,7 +267,7 @@ class Survey(HoldRules[SurveyState]):
         stop, deck, due = s.stop, motion.deck, s.due[:CHUNK]
         if stop is not None and stop.kind is StopKind.CALIBRATE:
             if is_on_drive(s.route.stops, deck.x_m, deck.y_m):
-                # What was measured of the drive is not lost, and the rest of it follows.
+                # Still on the calibration drive: continue it.
                 return replace(s, is_off_route=False)
             s = replace(s, wants_calibration=True)
         try:
@@ -278,7 +278,7 @@ class Survey(HoldRules[SurveyState]):
         return replace(s, route=route, stop_index=0, behaviour=None, is_off_route=False)
 
     def _review_time(self, s: SurveyState, motion: StateEstimate) -> tuple[SurveyState, bool]:
-        """After a point: the points for which there is no time are left out; false where it goes home now."""
+        """After a point, leave out the points for which there is no time; false if the robot has to go home now."""
         s, budget = replace(s, is_review_due=False), self._budget
         if budget is None:
             return s, True
@@ -328,7 +328,7 @@ class Survey(HoldRules[SurveyState]):
             return self.proceed(s), HOLD_POSITION
         mission = self.cfg.mission
         retreat, twist = s.behaviour.update(mission, self.follower.tracker, motion, verdict, is_slow=s.is_slow)
-        # On the way home there is no route to turn to; the way home begins from here.
+        # After an abort no turn away is needed: the way home is planned from here.
         if retreat.step is RetreatStep.OVER or (retreat.step is RetreatStep.TURN_AWAY and s.abort_cause):
             return self.apply(replace(s, behaviour=None), MissionEvent.FIND), HOLD_POSITION
         if retreat.step is RetreatStep.STUCK:
@@ -376,7 +376,7 @@ class Survey(HoldRules[SurveyState]):
         return s, None
 
     def _take_over(self, s: SurveyState, event: TakenOver) -> SurveyState:
-        """What has a meaning in any process is kept: not what it was doing, its times, and the last verdict."""
+        """The state for a new process: without behaviour, times and the last verdict."""
         measured, skipped, elapsed_s, is_new_run = event
         if is_new_run:
             if s.mode is DONE and s.outcome is not SurveyOutcome.STOPPED:
@@ -401,17 +401,17 @@ class Survey(HoldRules[SurveyState]):
         )
 
     def _recover(self, s: SurveyState, cause: str, t_s: float) -> SurveyState:
-        """Hold, and go on with a fix; what comes again and again is a fault."""
+        """Hold and relocalize; repeated divergence is a fault."""
         if s.mode is DONE or s.is_held_by_hand:
             return s
         health = self.cfg.health
         times_s = [since_s for since_s in s.recoveries_s if t_s - since_s <= health.retry_window_s]
         if times_s and t_s - times_s[-1] <= health.pause_limit_s:
-            times_s.pop()  # still the same: frame by frame it is asked for again
+            times_s.pop()  # still the same divergence, which is reported in every frame
         s = replace(s, recoveries_s=(*times_s, t_s))
         if len(s.recoveries_s) > 1 + health.retries:
             return self.fault(s, cause, loses_pose=True)
-        # A filter that is frozen does not show when the robot stands.
+        # A frozen filter does not show when the robot stands, so the hold lasts for a fixed time.
         return replace(self.await_recovery(s, cause), resumes_after_s=t_s + health.retry_after_s)
 
     def _fixed(self, s: SurveyState, event: FixStored) -> SurveyState:
@@ -420,26 +420,26 @@ class Survey(HoldRules[SurveyState]):
             return self._leave_stop(s, point, event.heading_sigma_rad, is_measured=True)
         if s.fix is FixNeed.NONE:
             return self._leave_pointless(s, event.heading_sigma_rad)
-        # The heading has to be found before the robot drives on.
+        # The heading has to be certain before the robot drives on.
         legs_left = 0 if event.heading_sigma_rad <= self.cfg.mission.heading_doubt_rad else s.heading_legs_left
         s = replace(s, heading_legs_left=legs_left)
         if legs_left > 0:
             return self.apply(replace(s, behaviour=None, is_missed=False), MissionEvent.GO_ON)
         goes_on = s.is_awaiting_fix
-        # Found again, the robot stands where the route never led. Unless it never left the start.
+        # After relocalizing, the robot is not on the route. After a confirmation at the start it is.
         s = replace(s, fix=FixNeed.NONE, is_found=True, is_off_route=s.is_lost)
         return self.proceed(s) if goes_on else s
 
     def _not_fixed(self, s: SurveyState, event: FixFailed) -> SurveyState:
         point, cause, sigma_rad = event
         if point is None and s.fix is FixNeed.NONE:
-            return self._leave_pointless(s, sigma_rad)  # the survey can do without
+            return self._leave_pointless(s, sigma_rad)  # the survey does not need this fix
         limit, failures = self.cfg.mission.failed_points_before_hold, s.failures + 1
         s = replace(s, failures=0 if failures >= limit else failures)
         if point is None:
             if failures >= limit:
                 return self.fault(s, conditions.NOT_FOUND.text(why=cause))
-            if isinstance(s.behaviour, Settling):  # it may not have stood quite still, and cannot do without
+            if isinstance(s.behaviour, Settling):  # this fix is needed; the robot may not have stood quite still
                 s = replace(s, behaviour=replace(s.behaviour, is_requested=False, is_repeated=True))
             return s
         s = replace(s, failure_causes={**s.failure_causes, point: cause}, due=_without(s.due, point))
@@ -448,7 +448,7 @@ class Survey(HoldRules[SurveyState]):
         return self._leave_stop(s, point, sigma_rad, is_measured=False)
 
     def _leave_pointless(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:
-        """A fix without a point was taken, or failed, where the survey can do without."""
+        """Continue after a fix, or a failed fix, at a stop without a point."""
         stop = s.stop
         if s.is_awaiting_fix and stop is not None and stop.kind in (StopKind.CALIBRATE, StopKind.VIA):
             s = replace(s, stop_index=s.stop_index + 1, behaviour=None)
@@ -456,7 +456,7 @@ class Survey(HoldRules[SurveyState]):
         return s
 
     def _doubt_heading(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:
-        """Where the fix showed that the pose was wrong, the heading is found before the robot drives on."""
+        """Determine the heading before the robot drives on, if a fix leaves it too uncertain."""
         if heading_sigma_rad > _LOST * self.cfg.mission.heading_doubt_rad and s.fix is not FixNeed.CONFIRM:
             return replace(s, heading_legs_left=MOST_LEGS, fix=FixNeed.RELOCALIZE)
         return s
@@ -465,7 +465,7 @@ class Survey(HoldRules[SurveyState]):
         self, s: SurveyState, point: PointId, heading_sigma_rad: float, *, is_measured: bool
     ) -> SurveyState:
         goes_on, stop = s.is_awaiting_fix, s.stop
-        # A pause may come while the fix is being committed, and a new way to the point: it counts all the same.
+        # A pause, and a new route to the point, may come while the fix is being stored. The fix counts all the same.
         is_here = stop is not None and stop.point == point
         if is_here or point not in (s.done if is_measured else s.skipped):
             s = replace(s, skipped=_without(s.skipped, point), is_review_due=self._budget is not None, backoffs=0)
@@ -475,13 +475,13 @@ class Survey(HoldRules[SurveyState]):
             else:
                 s = replace(s, skipped=(*s.skipped, point))
             if not is_here:
-                s = replace(s, is_off_route=True)  # the way that was planned leads to it once more
+                s = replace(s, is_off_route=True)  # the planned route leads to the point again
             elif isinstance(s.behaviour, Leg) and s.fix is FixNeed.NONE:
                 s = replace(s, stop_index=s.stop_index + 1, behaviour=None)
             else:
                 s = replace(s, stop_index=s.stop_index + 1)
             s = self._doubt_heading(s, heading_sigma_rad)
-            # So it does where the robot was pushed meanwhile and waits to be measured again: there is no need any more.
+            # A robot that was pushed meanwhile waits for another measurement, which is not needed any more.
             goes_on |= s.mode in (SETTLING, MEASURING)
         return self.proceed(s) if goes_on else s
 
@@ -491,7 +491,7 @@ def _without(points: tuple[PointId, ...], point: PointId) -> tuple[PointId, ...]
 
 
 class Mission:
-    """One survey under way: the state, shared by those who send frames and those who send events."""
+    """A running survey: its state, shared by the callers that send frames and those that send events."""
 
     def __init__(self, survey: Survey, state: SurveyState | None = None) -> None:
         self.survey = survey
@@ -503,6 +503,6 @@ class Mission:
         return command
 
     def handle(self, event: SurveyInput) -> str | None:
-        """An event between two frames; why it was refused, or ``None``."""
+        """Apply an event between two frames; returns why it was refused, or ``None``."""
         self.state, refusal = self.survey.handle(self.state, event)
         return refusal

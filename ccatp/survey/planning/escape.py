@@ -20,9 +20,9 @@ from ccatp.survey.planning.search import SearchNode, leg_time, turn_time
 
 _TURNS_RAD = np.radians(np.arange(-180, 181, 2))
 _NO_TURN = len(_TURNS_RAD) // 2
-# Further it would creep along the rim; straight away from it, or out of a corner, 0.2 m are enough.
+# A longer leg would only lead along the rim; straight away from it, or out of a corner, 0.2 m are enough.
 _DISTANCES_M = np.r_[0:401:10] * 1e-3
-# Half way between two turns a sensor at 0.13 m is at most 0.13 (1 - cos(1 deg)) = 20 um further out than in them.
+# Between two turns a sensor at 0.13 m is at most 0.13 (1 - cos(1 deg)) = 20 um further out than at them.
 _BETWEEN_TURNS_M = 2e-5
 _ROUNDING_M = 1e-6
 _MILLIMETRE_M = 1e-3
@@ -31,9 +31,9 @@ _MILLIMETRE_M = 1e-3
 def find_escape(mirror: Mirror, body: Body, start: SearchNode, limits: LimitsConfig) -> SearchNode:
     """The best single turn and straight leg, forward or in reverse, to a place where the robot can turn freely.
 
-    Best is what brings no sensor nearer to the rim than ``turn_clearance_m``, or than it is already; of those the
-    fastest, with the smallest turn. Where a sensor has to come nearer, the one that brings it least far. Raises
-    ``UnreachableError`` if there is no such place within 0.4 m.
+    It brings no sensor nearer to the rim than ``turn_clearance_m``, or than it is already. If every motion does so, the
+    one that brings a sensor least near is best. Otherwise the fastest is best, and then the smallest turn. Raises
+    ``UnreachablePointError`` if there is no such place within 0.4 m.
     """
     x0, y0 = start.place.x_m, start.place.y_m
     courses = start.course_rad + _TURNS_RAD
@@ -56,7 +56,7 @@ def find_escape(mirror: Mirror, body: Body, start: SearchNode, limits: LimitsCon
         if best is not None and (deficit_mm, cost_s, turn_rad) >= best[:3]:
             continue
         place = LegPlace(float(xs[turn, way, step]), float(ys[turn, way, step]), float(depths[turn, way, step]))
-        # Never outward, not even past a re-entrant corner.
+        # The leg never leads outward, not even past a re-entrant corner.
         if mirror.rim.segment_clearance_m(x0, y0, place.x_m, place.y_m) >= start.place.depth_m - _ROUNDING_M:
             best = deficit_mm, cost_s, turn_rad, SearchNode(place, float(courses[turn]), cost_s, way == 1, start)
     if best is None:
@@ -68,7 +68,7 @@ def find_escape(mirror: Mirror, body: Body, start: SearchNode, limits: LimitsCon
 
 
 def _swept(at_turn: FloatArray) -> FloatArray:
-    """Least sensor depth during a turn in place to each of ``_TURNS_RAD``, given that at each of them, m."""
+    """Least sensor depth during a turn in place to each of ``_TURNS_RAD``, m; ``at_turn``: depth at each of them."""
     left = np.minimum.accumulate(at_turn[_NO_TURN:])
     right = np.minimum.accumulate(at_turn[_NO_TURN::-1])
     return np.concatenate((right[:0:-1], left))
@@ -80,12 +80,10 @@ _COURSES_RAD = np.radians([0, 90, 180, 270])[:, None] + _SLANTS_RAD  # (sides, s
 
 
 def find_retreats(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
-    """For each place where the robot cannot turn freely the nearest ones around it where it can.
+    """For each place where the robot cannot turn freely, the nearest places around it where it can; else none.
 
-    None where it can turn.
-
-    At most one to each side of the grid of panels, straight or slightly slanted: slanted where the place is in a
-    corner, or to move off along the rim.
+    At most one in each direction of the grid of panels, straight or slightly slanted (for a place in a corner, or to
+    move off along the rim).
     """
     near = [k for k, place in enumerate(places) if place.blocked is not None]
     x0 = np.array([places[k].x_m for k in near]).reshape(-1, 1, 1, 1)
@@ -113,18 +111,18 @@ def _nearest(place: LegPlace, body: Body, depths: FloatArray, courses_rad: Float
     )
 
 
-_SHORTEST_M = 0.08  # a leg shorter than this teaches less than it costs
+_SHORTEST_M = 0.08  # a shorter leg calibrates too little for the time it takes
 _STEP_M = 0.02
-_BESIDE_M = 0.03  # so far beside its line a drive can still go on
+_BESIDE_M = 0.03  # largest distance from its line at which a drive can continue
 
 
 def plan_calibration(mirror: Mirror, body: Body, mission: MissionConfig, base: DeckPose) -> tuple[Stop, ...]:
     """Rounds of four legs between base and a place behind or before it; they end at base with the heading of the start.
 
-    There and back along one line, once driven with the same heading and once with the opposite one: a wrong heading
-    shifts the two ends against each other, creep shifts both downhill, slip shortens both legs, and two half turns tell
-    a wrong wheel base from a wrong gyroscope. So the first leg of the survey is driven with errors that are known. A
-    second round shows whether slip and creep are the same again. No stops where there is no room.
+    The robot drives forth and back along a line twice, with opposite headings. A wrong heading shifts the two ends
+    against each other, creep shifts both downhill, slip shortens both legs, and the two half turns separate the errors
+    of wheel base and gyroscope. So these errors are known before the first leg of the survey. A second round shows
+    whether slip and creep are constant. Without room there are no stops.
     """
     depth_m = max(body.turning_depth_m, mission.leg_clearance_m)
     course, home = course_of_heading(mirror, base), (base.x_m, base.y_m)
@@ -143,7 +141,7 @@ def plan_calibration(mirror: Mirror, body: Body, mission: MissionConfig, base: D
 
 
 def is_on_drive(stops: Sequence[Stop], x_m: float, y_m: float) -> bool:
-    """Whether a calibration drive can go on from a deck place: it lies on its line."""
+    """Whether a deck place lies on the line of a calibration drive, so that the drive can continue there."""
     ends = dict.fromkeys((stop.x_m, stop.y_m) for stop in stops if stop.kind is StopKind.CALIBRATE)
     if len(ends) != 2:
         return False

@@ -1,4 +1,4 @@
-"""Straight legs against the rim, the way around a stepped corner, where the robot can stand and turn.
+"""Which straight legs and turns keep the clearance from the rim, and the way around a stepped corner.
 
 A course is a direction in the deck plane; a heading is the angle in the tangent plane that projects on it.
 """
@@ -20,24 +20,24 @@ from ccatp.mirror.rim import Rim, to_segment_m
 
 _BINS = 360
 _BIN_RAD = tau / _BINS
-# Half way between two bins a sensor at 0.13 m is at most 0.13 (1 - cos(0.5 deg)) = 5 um further out than in them.
+# Between two bins a sensor at 0.13 m is at most 0.13 (1 - cos(0.5 deg)) = 5 um further out than at them.
 _BETWEEN_BINS_M = 1e-5
-# A turn this near to half a turn may go either way round: the noise of the heading decides.
+# A turn this near to half a turn may go either way, depending on the noise of the heading.
 _AMBIGUOUS_RAD = 0.1
-# Beyond what turning needs, so that a place found on one grid is still a place to turn after rounding.
+# Added to the depth that turning needs, so that a place on one grid remains a place to turn after rounding.
 _SPARE_M = 0.001
-# A shorter leg to a point at the rim is steered by the error of the position: 1 mm on 20 mm are the 0.05 rad that need
-# no turn. A turn before it leaves an error of a part of the lever at which the tyres rub.
+# On a shorter leg the error of the position dominates the steering: 1 mm on 20 mm is the 0.05 rad that needs no turn.
+# The turn before the leg adds an error proportional to the friction lever of the tyres.
 _RETREAT_M = 0.02
 _RETREAT_TYRES = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LegPlace:
-    """A place on the deck, and near the rim which courses the robot can face there.
+    """A place on the deck and, near the rim, the courses that the robot can face there.
 
-    ``blocked`` is the running number of the courses, of 360, on which a sensor does not keep its clearance, over four
-    turns: any arc is one difference. ``None`` where the robot can turn freely.
+    ``blocked``: cumulative count, over four turns of 360 courses, of those on which a sensor does not keep its
+    clearance; the number in an arc is one difference. ``None`` where the robot can turn freely.
     """
 
     x_m: float
@@ -50,7 +50,7 @@ class LegPlace:
         return self._is_free(course_rad % tau + tau, 0.0)
 
     def can_turn(self, from_rad: float, to_rad: float) -> bool:
-        """Whether it can turn in place the short way from one course to another; near half a turn, either way."""
+        """Whether the robot can turn in place the short way between two courses; near half a turn, both ways."""
         start = from_rad % tau + tau
         angle = difference(to_rad, from_rad)
         if not self._is_free(start, angle):
@@ -68,9 +68,9 @@ class LegPlace:
 
 
 class Body(NamedTuple):
-    """The robot as its edge sensors see it: their places in the robot frame, (4, 2), and the largest distance, m.
+    """The edge sensors in the robot frame, (4, 2), the distance of the furthest, and the clearances, m.
 
-    ``shortest_retreat_m``: of the leg from where it turns to a point at the rim.
+    ``shortest_retreat_m``: least length of the leg from the place of the turn to a point at the rim.
     """
 
     sensors_m: FloatArray
@@ -81,12 +81,12 @@ class Body(NamedTuple):
 
     @property
     def turning_depth_m(self) -> float:
-        """Distance from the rim at which the robot may stand and turn as it likes."""
+        """Distance from the rim at which the robot may stand and turn freely."""
         return max(self.reach_m + self.turn_clearance_m, self.leg_clearance_m) + _SPARE_M
 
 
 def build_body(robot: RobotConfig, mission: MissionConfig) -> Body:
-    """The robot's body and its clearances out of the configuration."""
+    """The robot's body and clearances from the configuration."""
     reach_m = max(hypot(x, y) for x, y in robot.edge_sensors_m)
     shortest_m = max(_RETREAT_M, _RETREAT_TYRES * robot.tyre_m)
     sensors_m = np.array(robot.edge_sensors_m)
@@ -96,10 +96,8 @@ def build_body(robot: RobotConfig, mission: MissionConfig) -> Body:
 def sensor_depths(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray, courses_rad: FloatArray) -> FloatArray:
     """Distance to the rim of the sensor nearest to it, m (< 0 beyond), of a robot at (x, y) facing a course.
 
-    Arrays broadcast.
-
-    The robot lies in the tangent plane; its sensors are projected on the deck: with the course u = (c, s) and the rise
-    g = fx c + fy s along it, ``h = (c, s, g)/sqrt(1 + g^2)`` and ``l = n x h``.
+    The arrays are broadcast. The robot lies in the tangent plane, and its sensors are projected on the deck: with the
+    course u = (c, s) and the rise g = fx c + fy s along it, ``h = (c, s, g)/sqrt(1 + g^2)`` and ``l = n x h``.
     """
     x, y, course = np.broadcast_arrays(xs, ys, courses_rad)
     fx, fy = mirror.surface.gradients(x, y)
@@ -114,7 +112,7 @@ def sensor_depths(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray, co
 
 
 def build_places(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray) -> list[LegPlace]:
-    """Places at deck coordinates of shape (n,), m; at those near the rim it is known which courses are free."""
+    """Places at deck coordinates of shape (n,), m, with the blocked courses of those near the rim."""
     depths = mirror.rim.signed_distances_m(xs, ys)
     near = np.flatnonzero(depths < body.turning_depth_m)
     courses: FloatArray = np.arange(_BINS, dtype=np.float64) * _BIN_RAD
@@ -128,28 +126,28 @@ def build_places(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray) -> 
 
 
 _ROUNDING_M = 1e-9
-# A sensor whose track meets a seam more steeply than 30 degrees is over it soon; the danger rules know how soon.
+# Sine of the angle between track and seam (30 deg) above which a sensor crosses a seam as the danger rules expect.
 _STEEP = 0.5
-# Further than this from a seam's border a track that should pass beside it does.
+# A track at least this far from a seam's border passes beside the seam in spite of errors.
 _BESIDE_M = 0.008
-# A track across a seam at 60 degrees from its normal is within the gap for twice its width. More is avoided: with a
-# little more slant, or a wide gap, the danger rules take it for the mirror's edge.
+# A track at 60 deg from the seam's normal is in the gap for twice its width. Longer crossings are avoided, because the
+# danger rules may take them for the mirror's edge.
 _LONGEST_CROSSING = 2.0
 
 
 class Grazing(IntEnum):
-    """How a leg lies to the seams that are oblique to it: the more, the worse."""
+    """How a leg lies to the seams that are oblique to it; a higher value is worse."""
 
     NONE = 0
     BESIDE = 1  # a sensor passes so near that errors may carry it over the gap
     ALONG = 2  # a sensor runs along within the gap: it cannot be distinguished from an edge
 
 
-_GRAZING_M = (0.0, 0.4, 4.0)  # what a way may be longer to be without
+_GRAZING_M = (0.0, 0.4, 4.0)  # accepted detour to avoid each
 
 
 class LegRules:
-    """Says which straight legs the robot may drive."""
+    """Decides which straight legs the robot may drive."""
 
     def __init__(self, mirror: Mirror, body: Body) -> None:
         self._rim, self._body = mirror.rim, body
@@ -161,7 +159,7 @@ class LegRules:
         self._beside_m = self._half_gap_m + _BESIDE_M
 
     def clearance_m(self, a: LegPlace, b: LegPlace) -> float:
-        """Clearance of the leg from ``a`` to ``b``: exact, or a lower bound that suffices for every rule, m."""
+        """Clearance of the leg from ``a`` to ``b``, m: exact, or a lower bound that is enough for every rule."""
         # The distance from the rim changes by at most the distance driven.
         at_least = 0.5 * (a.depth_m + b.depth_m - hypot(b.x_m - a.x_m, b.y_m - a.y_m))
         if at_least >= self._body.turning_depth_m:
@@ -169,7 +167,7 @@ class LegRules:
         return self._rim.segment_clearance_m(a.x_m, a.y_m, b.x_m, b.y_m)
 
     def is_enough(self, clearance_m: float) -> bool:
-        """Whether the robot's origin may pass the rim so near."""
+        """Whether the robot's origin may pass the rim at this distance."""
         return clearance_m >= self._body.leg_clearance_m - _ROUNDING_M
 
     def is_clear(self, a: LegPlace, b: LegPlace) -> bool:
@@ -177,10 +175,10 @@ class LegRules:
         return self.is_enough(self.clearance_m(a, b))
 
     def are_sensors_clear(self, a: LegPlace, b: LegPlace, course_rad: float, clearance_m: float) -> bool:
-        """Whether the sensors of a robot that faces ``course_rad`` all the way keep ``clearance_m`` between the ends.
+        """Whether all sensors keep ``turn_clearance_m`` between the ends of a leg on which the robot faces a course.
 
-        Where no re-entrant corner is near, the mirror is convex, and a sensor is nearest to the rim at an end of its
-        straight track, which the places check.
+        Away from re-entrant corners the mirror is convex. There a sensor is nearest to the rim at an end of its
+        straight track, which the places check. ``clearance_m``: of the robot's origin.
         """
         body = self._body
         if clearance_m >= body.reach_m + body.turn_clearance_m:
@@ -227,11 +225,11 @@ class LegRules:
         return within > self._explained_m
 
     def way_around(self, a: LegPlace, b: LegPlace) -> tuple[LegPlace, ...]:
-        """Best chain of places that leads from ``a`` around stepped corners to ``b``, ends left out.
+        """Best chain of places from ``a`` around stepped corners to ``b``, without the ends.
 
-        Dijkstra's algorithm on the visibility graph of the corners, inset by the clearance, and of the two elbows from
-        which both ends lie along the panels' rows and columns: on such legs no sensor runs along a seam. Empty where
-        the straight leg is good, and where there is no way.
+        Dijkstra's algorithm on the visibility graph of the corners, inset by the clearance, and of the two elbows,
+        which are joined to both ends along the panels' rows and columns: on such legs no sensor runs along a seam.
+        Empty if the straight leg is good, and if there is no way.
         """
         if self._is_good(a, b):
             return ()
@@ -259,7 +257,7 @@ class LegRules:
         return tuple(reversed(chain))
 
     def elbows(self, sources: Iterable[LegPlace], targets: Sequence[LegPlace]) -> list[LegPlace]:
-        """Elbows between all places of two groups between which the straight leg is not good."""
+        """Elbows between all places of two groups that no good straight leg joins."""
         return [elbow for a in sources for b in targets if not self._is_good(a, b) for elbow in self._elbows(a, b)]
 
     def _is_good(self, a: LegPlace, b: LegPlace) -> bool:
@@ -304,7 +302,7 @@ def _reentrant_corners(mirror: Mirror, body: Body) -> tuple[list[tuple[float, fl
         if (x1 - x0) * (y2 - y1) - (y1 - y0) * (x2 - x1) >= 0.0:
             continue
         corners.append((x1, y1))
-        # The bisector between coming from the last vertex and going on against the next points to the inside.
+        # The direction of the edge before plus the reverse direction of the edge after points to the inside.
         before, after = atan2(y1 - y0, x1 - x0), atan2(y1 - y2, x1 - x2)
         inset = max(body.leg_clearance_m, body.turning_depth_m / 2**0.5) + _ROUNDING_M
         x, y = x1 + inset * (cos(before) + cos(after)), y1 + inset * (sin(before) + sin(after))
@@ -334,11 +332,11 @@ class PlanError(CcatpError):
 
 
 class OutsideMirrorError(PlanError):
-    """A path was asked for from a place that is not on the mirror."""
+    """The start of a path is not on the mirror."""
 
 
 class UnreachablePointError(PlanError):
-    """No sequence of turns and straight legs leads there with the clearances of the configuration."""
+    """No sequence of turns and straight legs with the configured clearances leads to the place."""
 
     exit_status = ExitStatus.USAGE
 
@@ -354,10 +352,10 @@ def room_m(
     spread: float = 0.0,
     leaving: float = inf,
 ) -> float:
-    """How far a leg may go in a direction of the deck plane so that the robot can turn at its end, up to ``wanted_m``.
+    """Length of a leg along the unit vector ``way`` in the deck plane at whose end the robot can turn, <= ``wanted_m``.
 
-    The clearance grows by ``spread`` along the leg; it is not asked for where at least the part ``leaving`` of a step
-    leads away from the rim.
+    The required clearance grows by ``spread`` per metre. It is not required while at least the part ``leaving`` of a
+    step leads away from the rim.
     """
     way_m, depth_m = 0.0, rim.signed_distance_m(deck.x_m, deck.y_m)
     while way_m < wanted_m:

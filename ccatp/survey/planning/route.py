@@ -1,4 +1,4 @@
-"""The route of a survey: measurement points in their order and the stops that lead from each to the next."""
+"""The route of a survey: the order of the measurement points, and the stops from each to the next."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ from ccatp.survey.planning.legs import (
 )
 from ccatp.survey.planning.search import Search, SearchNode, path_time, stop_times, turn_time
 
-_REPLANNED_POINTS = 4  # at least, before the old route is joined again
-_LONGEST_LEG_HOME_M = 0.75  # about one stop per panel: there the robot points itself at base again
+_REPLANNED_POINTS = 4  # least number of points planned again before the old route continues
+_LONGEST_LEG_HOME_M = 0.75  # about one stop per panel, at which the robot turns to base again
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +35,16 @@ class Route:
     times_s: tuple[float, ...]
 
     def remaining_s(self, index: int) -> float:
-        """Least time that is left while stop ``index`` is being approached, s; 0 behind the last."""
+        """Least remaining time while stop ``index`` is being approached, s; 0 after the last."""
         return self.times_s[min(index, len(self.stops))]
 
 
 class RoutePlanner:
-    """Plans the ways of a survey on a mirror.
+    """Plans the routes of a survey on a mirror.
 
     The robot turns in place and moves straight, forward or in reverse. On every leg its origin keeps
-    ``leg_clearance_m`` from the rim and all its edge sensors ``turn_clearance_m``, during turns too; where the thesis's
-    straight way does not, stops are put in between.
+    ``leg_clearance_m`` from the rim, and all its edge sensors keep ``turn_clearance_m``, also in turns. Where the
+    thesis's straight way does not, stops are inserted.
     """
 
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
@@ -62,17 +62,18 @@ class RoutePlanner:
     ) -> Route:
         """The fastest drivable sequence of stops through the points from a deck pose.
 
-        Raises ``OutsideMirrorError`` (start); ``UnreachableError`` for a point, unless ``out_of_reach`` takes it.
+        Raises ``OutsideMirrorError`` (start). An unreachable point raises ``UnreachablePointError``, or is added to
+        ``out_of_reach``.
         """
         left = set(points).difference(skip)
         wanted = [point for point in points if point in left]
         return self._timed(self._stops(wanted, start, out_of_reach), start)
 
     def rejoin(self, route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
-        """The way from a deck pose back to a route: its next points planned again, the rest as it was.
+        """Plan the next points of a route again from a deck pose; the rest stays as it was. Raises as ``route``.
 
-        Raises as ``route``. Planning a whole mirror again takes longer than the robot's frames may wait. The new part
-        ends at a point where the robot can turn freely, so that it does not matter how it arrives there.
+        Planning a whole mirror takes too long within a frame. The new part ends at a point where the robot can turn
+        freely, so that the course of its arrival does not matter.
         """
         left = [k for k, stop in enumerate(route.stops) if stop.point is not None and stop.point not in skip]
         free = (
@@ -86,16 +87,16 @@ class RoutePlanner:
         return _followed(self.route(start, points), route, left[count - 1] + 1 if left else len(route.stops))
 
     def with_calibration(self, route: Route) -> Route:
-        """A route from base with the calibration drive before it."""
+        """A route from base, with the calibration drive before it."""
         base = self._mirror.base_pose
         return _followed(self._timed(plan_calibration(self._mirror, self._body, self._mission, base), base), route, 0)
 
     def home(self, start: DeckPose, base: DeckPose | None = None) -> tuple[Stop, ...]:
         """Stops from a deck pose anywhere on the mirror to base; the last is base itself, with its heading.
 
-        Near the rim the first stop leads straight away from it, forward or in reverse, to where the robot can turn.
-        From there on legs and turns keep the clearances of a survey. Raises ``OutsideMirrorError`` (start), and
-        ``UnreachableError`` if base lies where the clearances allow no way.
+        Near the rim the first leg leads straight away from it, forward or in reverse, to a place where the robot can
+        turn. From there legs and turns keep the clearances of a survey. Raises ``OutsideMirrorError`` (start), and
+        ``UnreachablePointError`` if the clearances allow no way to base.
         """
         base = base or self._mirror.base_pose
         places, first = self._places(start, [(base.x_m, base.y_m)])
@@ -105,7 +106,7 @@ class RoutePlanner:
             raise self._unreachable(f"base at ({base.x_m:.3f}, {base.y_m:.3f}) m", goal)
 
         def rank(arrival: SearchNode) -> tuple[bool, float]:
-            """One from which the turn to the final course is safe, if there is; then the cheapest, with that turn."""
+            """Prefer an arrival with a safe turn to the final course; then the cheapest, with that turn."""
             turned_s = turn_time(difference(course, arrival.course_rad), self._limits)
             return not arrival.place.can_turn(arrival.course_rad, course), arrival.cost_s + turned_s
 
@@ -115,7 +116,7 @@ class RoutePlanner:
         return in_parts((start.x_m, start.y_m), ends, _LONGEST_LEG_HOME_M)
 
     def _places(self, start: DeckPose, targets: list[tuple[float, float]]) -> tuple[list[LegPlace], SearchNode]:
-        """The start and the targets; where the robot stands, or too near the rim to turn, its first move ends."""
+        """Places of start and targets, and the first node: the start, or the end of its escape from the rim."""
         mirror, body = self._mirror, self._body
         xy = np.array([(start.x_m, start.y_m), *targets])
         places = build_places(mirror, body, xy[:, 0], xy[:, 1])
@@ -126,7 +127,7 @@ class RoutePlanner:
         return places, first if places[0].blocked is None else find_escape(mirror, body, first, self._limits)
 
     def _retreats(self, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
-        """Where to turn near each place; at the start, near the rim, it is away from the rim first."""
+        """Places to turn near each place; none for the start, which has its escape from the rim."""
         return [(), *find_retreats(self._mirror, self._body, places[1:])]
 
     def _unreachable(self, what: str, place: LegPlace) -> UnreachablePointError:
@@ -154,7 +155,7 @@ class RoutePlanner:
             place, point_there = arrival.place, point_of.get(arrival.place)
             kind = StopKind.VIA if point_there is None else StopKind.MEASURE
             ends.append(Stop(place.x_m, place.y_m, kind, point_there, arrival.reverse))
-        # A heading that is off by 10 mrad misses by a centimetre after a metre: long legs are looked after on the way.
+        # A heading error of 10 mrad gives 10 mm after a metre, so long legs get stops on the way.
         return in_parts((start.x_m, start.y_m), ends, self._mission.longest_leg_m)
 
     def _timed(self, stops: tuple[Stop, ...], start: DeckPose) -> Route:
@@ -166,14 +167,14 @@ class RoutePlanner:
 
 
 def _followed(head: Route, route: Route, index: int) -> Route:
-    """``head``, and then ``route`` from stop ``index`` on."""
+    """``head``, followed by ``route`` from stop ``index``."""
     rest_s = route.times_s[index]
     times_s = tuple(t + rest_s for t in head.times_s[:-1]) + route.times_s[index:]
     return Route(head.stops + route.stops[index:], times_s)
 
 
 def in_parts(start: tuple[float, float], ends: Sequence[Stop], longest_m: float) -> tuple[Stop, ...]:
-    """The straight legs from a deck place through stops, each in equal parts that are not too long."""
+    """The stops with via points inserted, so that the straight legs have equal parts not longer than ``longest_m``."""
     stops: list[Stop] = []
     x_m, y_m = start
     for end in ends:
@@ -189,16 +190,16 @@ def in_parts(start: tuple[float, float], ends: Sequence[Stop], longest_m: float)
 def fastest_serpentine(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) -> list[PointId]:
     """The points line by line, every second line backwards: the fastest from base of all eight such orders.
 
-    On a line nothing has to be turned for, so that quarter turns remain at the ends of the lines only. Compared are
-    the least times of the straight legs from point to point, turns included; of equals the first of ``serpentines``.
+    The robot turns only at the ends of the lines, by quarter turns. The least times of the straight legs, with turns,
+    are compared; of equal ones the first of ``serpentines`` is taken.
     """
     return min(serpentines(points), key=lambda order: _straight_time(mirror, order, limits))
 
 
 def serpentines(points: Sequence[PointId]) -> Iterator[list[PointId]]:
-    """All eight serpentines: along the rows, along the columns; each from any of its corners."""
+    """All eight serpentines: along the rows and along the columns, from each of the four corners."""
     for split in (_on_row, _on_column):
-        # Line and place within the line, both counted over the whole grid of panels.
+        # Line, and place within the line, both counted over the whole grid of panels.
         by_line = groupby(sorted(points, key=split), key=lambda point: split(point)[0])
         lines = [list(line) for _, line in by_line]
         for stacked in (lines, lines[::-1]):
@@ -222,11 +223,12 @@ def _straight_time(mirror: Mirror, order: Sequence[PointId], limits: LimitsConfi
     return path_time(stops, mirror.base_pose, limits, mirror, 0.0)
 
 
-# Mirror, number of panels (0 = all): a resumed mission and its summary find the same order from nothing else.
+# From mirror and number of panels (0 = all). It depends on nothing else, so that a resumed mission and its summary get
+# the same order.
 Order = Callable[[Mirror, int], list[PointId]]
 
-# By these, those of the thesis's robot (its speed) and of the stand-in (the rest, UNVERIFIED), turns are weighed
-# against ways. Not by the configured ones: a survey goes on in the order in which it began, whatever its limits are.
+# Limits by which orders are compared: the speed of the thesis's robot, and the rest of the stand-in (UNVERIFIED). They
+# are not the configured ones, so that a resumed survey keeps its order whatever its limits are.
 NOMINAL_LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=1.0, alpha_max_rad_s2=2.0)
 
 # Points 1 to 9 are numbered row by row from the panel's lower left (thesis fig. 2.2). Each order is a serpentine over
@@ -248,11 +250,9 @@ def panel_order(panel: PanelId) -> tuple[int, ...]:
 
 
 def thesis_order(mirror: Mirror, panels: int = 0) -> list[PointId]:
-    """Points in the order of the thesis (table 3.1, fig.
+    """Points in the order of the thesis (table 3.1, fig. 3.2): panel by panel, odd rows towards +column, even back.
 
-    3.2): panel by panel, odd rows towards +column, even rows back.
-
-    ``panels``: the first so many only, 0 = all; raises ``ValueError`` if negative.
+    ``panels``: number of panels, 0 = all; raises ``ValueError`` if negative.
     """
     if panels < 0:
         raise ValueError(f"panels = {panels}: a survey takes 0 (= all) or more panels")
@@ -262,12 +262,12 @@ def thesis_order(mirror: Mirror, panels: int = 0) -> list[PointId]:
 
 
 def optimised_order(mirror: Mirror, panels: int = 0, limits: LimitsConfig = NOMINAL_LIMITS) -> list[PointId]:
-    """The same points in whole lines across the panels, see ``fastest_serpentine``; raises as ``thesis_order``."""
+    """The same points in lines across all panels, see ``fastest_serpentine``; raises as ``thesis_order``."""
     return fastest_serpentine(mirror, thesis_order(mirror, panels), limits)
 
 
 def no_points(mirror: Mirror, panels: int = 0) -> list[PointId]:
-    """None: a drive that consists of its calibration alone."""
+    """No points, for a run that consists of the calibration drive alone."""
     del mirror, panels
     return []
 

@@ -10,8 +10,8 @@ from ccatp.core import DeckPose, Stop, bearing, difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import LegPlace, LegRules, heading_of_course
 
-# A leg that begins within this of the heading is steered for on the way and needs no turn in place, by
-# control.straight_tolerance_rad; the points of a row, dropped on the curved surface, lie on a straight line to 10 mrad.
+# A leg whose bearing differs less than this from the heading needs no turn in place, as control.straight_tolerance_rad.
+# The points of a row, projected on the curved surface, lie on a straight line to 10 mrad.
 STRAIGHT_RAD = 0.05
 
 
@@ -68,12 +68,12 @@ def leg_lengths(stops: Sequence[Stop], start: DeckPose, mirror: Mirror) -> list[
     return [dist(a, b) for a, b in pairwise(points)]
 
 
-# What a stop costs beyond the bang-bang time of its legs: the servo's lag and settling.
+# Cost of a stop in addition to the bang-bang time of its legs: lag of the servo and settling.
 STOP_S = 0.15
-# Of two ways that cost the same take the one driven forward.
+# Of two ways with the same cost, the one driven forward is taken.
 _REVERSE_S = 0.01
-# What a way may cost more on which no sensor runs along a seam, by ``Grazing``. Met, such an edge costs ten seconds; of
-# those beside the way few are met. Those along it are met again and again, until the robot waits for an operator.
+# Cost of a leg on which a sensor runs along a seam, by ``Grazing``. A seam taken for an edge costs ten seconds. Beside
+# the track this is rare; along the track it repeats until the robot waits for an operator.
 _GRAZING_S = (0.0, 3.0, 60.0)
 
 
@@ -88,7 +88,7 @@ class SearchNode:
     before: "SearchNode | None" = None
 
     def path(self) -> list["SearchNode"]:
-        """The arrivals on the way here, the start left out."""
+        """The arrivals on the way to this one, without the start."""
         path = []
         arrival = self
         while arrival.before is not None:
@@ -101,10 +101,10 @@ Frontier = dict[LegPlace, list[SearchNode]]
 
 
 class Search:
-    """Finds the way through targets in their order.
+    """Finds the way through targets in their order, each leg forward or in reverse.
 
-    Between two targets the robot may drive straight on, turn at a retreat of the first or of the second or of both,
-    and has to drive around stepped corners; each leg forward or in reverse.
+    Between two targets the robot may drive straight, or turn at a retreat of the first, the second or both. It drives
+    around stepped corners.
     """
 
     def __init__(self, rules: LegRules, limits: LimitsConfig) -> None:
@@ -117,7 +117,7 @@ class Search:
         target: LegPlace,
         target_retreats: tuple[LegPlace, ...] = (),
     ) -> list[SearchNode]:
-        """All sensible ways on to the next target, by places to turn near either end; none where there is no way."""
+        """Arrivals at the next target over the places to turn near either end; empty if there is no way."""
         here = arrivals[0].place
         frontier: Frontier = {here: list(arrivals)}
         frontier |= self._extend(frontier, retreats)

@@ -1,4 +1,4 @@
-"""A time that no order of the measurement points can beat, whatever it is: by this orders are judged."""
+"""Lower bound of the time of a tour through the measurement points in any order, to judge orders by."""
 
 from collections.abc import Sequence
 from math import pi
@@ -14,17 +14,17 @@ from ccatp.core import FloatArray, IntArray, PointId
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.search import STRAIGHT_RAD
 
-# Legs to so many nearest places, at least, are distinguished: the eight around a point of the grid. All further legs of
-# a place count as its shortest two of them.
+# Least number of nearest places whose legs are distinguished: the eight around a point of the grid. All further legs of
+# a place count as the two shortest of them.
 _NEAR = 8
-_NONE = -1  # in place of a near leg: a far one, or none
+_NONE = -1  # index that stands for a far leg or no leg
 
 
 class _Choices(NamedTuple):
-    """What each place can be joined to, one choice a row, the choices of a place one after the other."""
+    """The possible neighbours of each place in a tour: one choice per row, the choices of a place in sequence."""
 
-    place: IntArray  # whose choice it is; 0 is base, shape (m,)
-    near: IntArray  # the near places it is joined to, ``_NONE`` for a far one or none, shape (m, 2)
+    place: IntArray  # the place; 0 is base, shape (m,)
+    near: IntArray  # its neighbours, ``_NONE`` for a far one or none, shape (m, 2)
     is_end: NDArray[np.bool_]  # the tour ends there, shape (m,)
     cost_s: FloatArray  # half of each leg, and the turn between them, shape (m,)
 
@@ -33,9 +33,9 @@ def tour_bound(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig, 
     """Least time that any tour takes from base through all points, in any order, s.
 
     A tour drives straight from point to point, forward or in reverse, rests at each and turns in place; it may end
-    anywhere. The rim is ignored. Stops in between are not counted in: a tour with some is bounded by its legs alone.
+    anywhere. The rim is ignored. Stops in between are not counted: a tour with such stops is bounded by its legs alone.
 
-    The bound: give half of each leg to either of its ends. Then a tour costs the sum over its places of
+    The bound: assign half of each leg to either of its ends. Then a tour costs the sum over its places of
     ``c_p(q, r) = (T_pq + T_pr)/2 + turn``, with q and r the neighbours of p; at base and at the last point, with one
     neighbour, of half a leg. Driving in reverse changes a heading by pi, so no turn is longer than pi/2. Let p pay a
     price ``l_pq`` for the leg to q, with ``l_qp = -l_pq``, and the last point pay a price m: along a tour the prices of
@@ -43,10 +43,9 @@ def tour_bound(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig, 
 
         tour >= sum over p of min over (q, r) of [c_p(q, r) + l_pq + l_pr (+ m at an end)] - m,
 
-    since each place of the tour chooses no cheaper than the cheapest. The prices that make it largest are the dual
-    values of the linear programme in which each place mixes its choices such that both ends of a leg agree about it;
-    should the solver stop early the bound gets lower, not wrong. Legs that are not near have no price and turn for
-    nothing, which makes choices cheaper only.
+    since no place of the tour costs less than its cheapest choice. The best prices are the dual values of the linear
+    programme in which each place mixes its choices such that both ends of a leg agree about it. If the solver stops
+    early, the bound is lower but still valid. Far legs have no price and no turn, which only lowers the bound.
     """
     if not points:
         return 0.0
@@ -75,14 +74,14 @@ def _bang_bang_times(distances: FloatArray, v_max: float, a_max: float) -> Float
 
 
 def _turn_times(angles_rad: FloatArray, limits: LimitsConfig) -> FloatArray:
-    """Least times of turns between two legs each of which may be driven either way, s."""
+    """Least times of turns between two legs, each driven forward or in reverse, s."""
     least = np.abs((angles_rad + pi / 2.0) % pi - pi / 2.0)
     times = _bang_bang_times(least, limits.omega_max_rad_s, limits.alpha_max_rad_s2)
     return np.where(least <= STRAIGHT_RAD, 0.0, times)
 
 
 def _choices(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) -> _Choices:
-    """Place by place, because a table of all legs would take gigabytes for thousands of points; base is place 0."""
+    """All choices, place by place, because a table of all legs would take gigabytes for thousands of points."""
     base = mirror.base_pose
     xy = np.array([(base.x_m, base.y_m), *(mirror.point_on_deck(point) for point in points)])
     surface = np.array([mirror.surface_point(x, y) for x, y in xy.tolist()])
@@ -91,7 +90,7 @@ def _choices(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) ->
         legs_s, headings = _leg_times(surface, k, limits), _headings(mirror, x, y, xy[near])
         near_s = legs_s[near]
         halves_s, far_s = near_s / 2.0, _least_far(legs_s, near, k) / 2.0
-        one = np.r_[np.c_[near, np.full(len(near), _NONE)], [(_NONE, _NONE)]]  # joined to one place alone
+        one = np.r_[np.c_[near, np.full(len(near), _NONE)], [(_NONE, _NONE)]]  # with a single neighbour
         if k == 0:
             turns_s = np.where(near_s > 0.0, _turn_times(headings - base.heading_rad, limits), 0.0)
             joined, costs_s, ends = one, np.r_[halves_s + turns_s, far_s[0]], 0
@@ -111,7 +110,7 @@ def _choices(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) ->
 
 
 def _near(surface: FloatArray, limits: LimitsConfig) -> list[IntArray]:
-    """For each place those that are among its nearest, or it among theirs, ascending."""
+    """For each place the near places, ascending: those among its nearest, or with it among theirs."""
     near: list[set[int]] = [set() for _ in surface]
     for k in range(len(surface)):
         legs_s = _leg_times(surface, k, limits)
@@ -129,10 +128,9 @@ def _least_far(legs_s: FloatArray, near: IntArray, own: int) -> FloatArray:
 
 
 def _priced(choices: _Choices) -> float:
-    """The sum of the cheapest choices at the prices that make it largest, s.
+    """The sum of the cheapest choices at the best prices, s.
 
-    The constraints: one choice for each place; of a leg's two ends the one pays what the other gets; the tour has one
-    end, the last row.
+    Constraints: one choice per place; both ends of a leg choose it equally; the tour has one end (last row).
     """
     places, m = int(choices.place[-1]) + 1, len(choices.cost_s)
     row, side = np.nonzero(choices.near != _NONE)
@@ -143,7 +141,7 @@ def _priced(choices: _Choices) -> float:
     where = np.r_[leg, np.full(len(ends), len(legs))], np.r_[row, ends]
     agreement = csr_array((signs, where), shape=(len(legs) + 1, m))
     one_each = csr_array((np.ones(m), (choices.place, np.arange(m))), shape=(places, m))
-    constraints: Any = vstack((one_each, agreement))  # its type says that it takes none that are sparse; it does
+    constraints: Any = vstack((one_each, agreement))  # ``linprog`` accepts sparse arrays, against its type annotation
     solution = linprog(
         choices.cost_s,
         A_eq=constraints,
