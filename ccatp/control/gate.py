@@ -1,7 +1,7 @@
-"""The last gates before the wheels and the fans; they deny by default.
+"""The gates for the commands to wheels and fans; they deny by default.
 
-A verdict that names an edge sensor bars that direction whatever its permits say; a survey moves under a normal verdict
-only.
+A verdict that names an edge sensor bars that direction, whatever its permits are. A survey moves only under a normal
+verdict.
 """
 
 from enum import Enum, StrEnum
@@ -12,15 +12,15 @@ from ccatp.config.models import LimitsConfig, RobotConfig
 from ccatp.core import EventCode, Twist, Verdict, wheel_rates
 
 HELD = Twist(0.0, 0.0)
-# The feed-forward of the wheel lag adds T a to the speed; a tenth covers it and the feedback.
+# Part of the limits: room for the feedback, and for the feed-forward of the wheel lag, which adds T a to the speed.
 HEADROOM = 1.25
-# A frame that comes after a longer silence allows no larger step than this one.
+# Longest time between frames for which the step of the set point grows.
 MAX_STEP_S = 0.1
 _NORMAL, _NEAR_EDGE, _ABORTED = EventCode
 
 
 class Purpose(Enum):
-    """What a motion is for."""
+    """Purpose of a motion."""
 
     STAND = "stand"
     SURVEY = "survey"
@@ -32,7 +32,7 @@ _STAND, _SURVEY, _RETREAT = Purpose.STAND, Purpose.SURVEY, Purpose.RETREAT
 
 
 class Denial(StrEnum):
-    """Why a drive became zero."""
+    """Why a drive was set to zero."""
 
     NOT_FINITE = "the set point is not finite"
     STATE = "the mission's state allows no motion"
@@ -47,11 +47,11 @@ class Denial(StrEnum):
 
 
 class DriveGate:
-    """Turns a wanted twist into wheel rates that are finite, limited and permitted, or into zero.
+    """Converts a wanted twist into wheel rates that are finite, limited and permitted, or into zero.
 
-    The feed-forward may step the set point by ``robot.wheel_lag_s``, the time constant T of the wheel servo, times the
-    acceleration limit. No decision is made on a verdict or a frame older than its timeout. ``denied`` counts each
-    reason; ``denial`` is that of the last call, None where the drive was passed or nothing was wanted.
+    The feed-forward may step the set point by the acceleration limit times ``robot.wheel_lag_s``, the time constant T
+    of the wheel servo. A frame or verdict older than its timeout denies the motion. ``denied`` counts each reason;
+    ``denial`` is that of the last call, None if the drive was passed or zero was wanted.
     """
 
     def __init__(self, limits: LimitsConfig, robot: RobotConfig, verdict_timeout_s: float) -> None:
@@ -70,7 +70,7 @@ class DriveGate:
     def pass_through(
         self, wanted: Twist, verdict: Verdict | None, dt_s: float, t_s: float, age_s: float, purpose: Purpose
     ) -> tuple[float, float]:
-        """Permitted wheel rates (right, left), rad/s, on a frame of robot time ``t_s`` and age ``age_s``."""
+        """Permitted wheel rates (right, left), rad/s, for a frame at robot time ``t_s`` with age ``age_s``."""
         v, omega = wanted.v_m_s, wanted.omega_rad_s
         if v == 0.0 and omega == 0.0:
             self._last, self.denial = HELD, None
@@ -82,7 +82,7 @@ class DriveGate:
             return 0.0, 0.0
         dt_s, last = min(dt_s, MAX_STEP_S), self._last
         v_step, omega_step = self._v_step + self._a * dt_s, self._omega_step + self._alpha * dt_s
-        # Away from zero a rate may change by a step only, towards zero at once.
+        # Away from zero a rate changes by at most a step, towards zero without limit.
         if v > 0.0:
             v = min(v, max(last.v_m_s, 0.0) + v_step, self._v_max)
         else:
@@ -101,7 +101,7 @@ class DriveGate:
     def _judge(
         self, v: float, omega: float, verdict: Verdict | None, dt_s: float, t_s: float, age_s: float, purpose: Purpose
     ) -> Denial | None:
-        """What stands in the way. Comparisons are written so that what is not a number does not pass."""
+        """Why the motion is denied, or None. The comparisons are written such that NaN is denied."""
         if not (isfinite(v) and isfinite(omega)):
             return Denial.NOT_FINITE
         if purpose is _STAND:
@@ -131,14 +131,14 @@ def _judge_direction(v: float, omega: float, verdict: Verdict, purpose: Purpose)
 
 
 class FanGate:
-    """Refuses duties that are not numbers, or below ``floor``, the least duty where the mirror overhangs."""
+    """Refuses duties that are not between 0 and 1, or below ``floor``, the least duty where the mirror overhangs."""
 
     def __init__(self, floor: float) -> None:
         self._floor = floor
         self.refused = 0
 
     def refusal(self, left: float, right: float) -> str | None:
-        """Why these duties must not be sent; None where they may. What the robot has stays in force then."""
+        """Why these duties must not be sent, or None. After a refusal the robot keeps its last duties."""
         for name, duty in (("left", left), ("right", right)):
             if not isfinite(duty) or not 0.0 <= duty <= 1.0:
                 why = f"duty {duty:g} of the {name} fan is not between 0 and 1"

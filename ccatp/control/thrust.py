@@ -1,13 +1,14 @@
-"""Thrust that holds the robot on its slope: what load, friction and manoeuvre need, and the fans' duty that gives it.
+"""Thrust that holds the robot on its slope, from load, friction and manoeuvre, and the fans' duty for it.
 
-Robot frame: x ahead, z along the normal away from the surface; gravity is the unit vector along which things fall. Two
-driven wheels at x = 0 carry the friction, a smooth caster at x = -c carries some of the load. With the centre of mass
-at (x, h), weights G and thrust T against the surface, moments about the axle give the caster's load, and the wheels
+Robot frame: x forward, z along the normal away from the surface; gravity is the unit vector of the direction of fall.
+Two driven wheels at x = 0 give the friction; a smooth caster at x = -c carries a part of the load. With the centre of
+mass at (x, h), weight G and thrust T against the surface, moments about the axle give the caster's load. The wheels
 hold while
 
     mu N >= |G tangential|,   N = (T - G_z)(1 + x/c) + G_x h/c.
 
-Downhill behind is the worst heading: the load goes to the caster. Downhill ahead it must not leave the ground.
+The worst heading has downhill behind, because the load moves to the caster. With downhill ahead, the caster must not
+lift.
 """
 
 from collections.abc import Sequence
@@ -21,21 +22,21 @@ from ccatp.core import GRAVITY_M_S2, DeckPose, Vector3, difference
 from ccatp.mirror.mirror import Mirror
 
 _RAMP_PER_S = 1.0  # of the duty
-_STEP = 0.02  # of the duty: smaller changes are not worth a command
-_STOP_WAY_M = 0.03  # an overrun at the rim that leaves two edge sensors on the mirror
+_STEP = 0.02  # of the duty; smaller changes are not commanded
+_STOP_WAY_M = 0.03  # stopping distance at the rim that leaves two edge sensors on the mirror
 _HEADINGS_RAD = tuple(k * pi / 4.0 for k in range(8))
-_LEAST_TURN_RAD = 1.0  # between two fixes: a shorter turn shows no creep
-_LEAST_USE = 0.1  # of tangential load by load of the wheels: a tyre that carries less shows no creep either
+_LEAST_TURN_RAD = 1.0  # turn between two fixes; a shorter one does not show the creep
+_LEAST_USE = 0.1  # tangential load over load of the wheels; with less the creep does not show either
 _MOST_FRICTION = 2.0
-_TURNS = 4  # that the mean creep is taken over
-_MOST_USE = 0.8  # of its friction by a wheel in a turn: beyond that it slides for moments, and the creep grows steeply
-_TILT_STEP = 1e-3  # sine of the slope's angle: creep differs by less than 1 % within it
-_MOST_SHARE = 0.95  # of the friction: closer to 1 the law has no bound
-_TOLERANCE = 1.8  # of the creep: by slope and heading it varies by so much with the friction that is promised
+_TURNS = 4  # number of turns in the mean creep
+_MOST_USE = 0.8  # part of its friction that a wheel uses in a turn; with more it slips, and the creep grows steeply
+_TILT_STEP = 1e-3  # step of the sine of the slope's angle, within which the creep changes by less than 1 %
+_MOST_SHARE = 0.95  # largest used part of the friction; the law diverges at 1
+_TOLERANCE = 1.8  # ratio by which the creep at the configured friction varies with slope and heading
 
 
 def least_thrust_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> float:
-    """Least thrust that holds the robot where it stands, or with ``turns`` at any heading there, N."""
+    """Least thrust that holds the robot at its place and heading, or with ``turns`` at any heading, N."""
     tangential, outward, ahead = _load_n(robot, gravity, turns=turns)
     x_m, height_m = robot.centre_of_mass_m
     share = 1.0 + x_m / robot.caster_m
@@ -45,10 +46,10 @@ def least_thrust_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> floa
 
 
 def turn_thrust_n(robot: RobotConfig, gravity: Vector3) -> float:
-    """Thrust for a turn, N: the margin over the least, and each wheel uses at most 0.8 of its friction at any heading.
+    """Thrust for a turn, N, so that it has its margin and each wheel uses at most 0.8 of its friction at any heading.
 
-    The slope takes load from the wheel that is higher, and a centre of mass behind the axle pulls at that wheel:
-    downhill behind and a little beside is the worst heading.
+    The slope reduces the load of the higher wheel, and a centre of mass behind the axle increases its side force. The
+    worst heading has downhill behind and a little to the side.
     """
     tangential, outward, _ = _load_n(robot, gravity, turns=True)
     x_m, height_m = robot.centre_of_mass_m
@@ -68,9 +69,9 @@ def _load_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> Vector3:
 
 
 class GripForecast(NamedTuple):
-    """Where on a mirror a turn needs most thrust: the least there, N, and what the fans make of it at full duty.
+    """The place on a mirror where a turn needs most thrust: least and wanted thrust there, and full thrust, N.
 
-    ``safe_speed_m_s``: see there; 0 where the robot cannot be held, or not stopped.
+    ``safe_speed_m_s``: see the function; 0 where the robot cannot be held or stopped.
     """
 
     place: DeckPose
@@ -81,7 +82,7 @@ class GripForecast(NamedTuple):
 
     @property
     def is_short(self) -> bool:
-        """Less than the configured margin over the least: slow."""
+        """Less than the configured margin over the least: the robot has to drive slowly."""
         return self.thrust_n < 0.999 * self.wanted_n
 
     @property
@@ -105,7 +106,7 @@ class GripForecast(NamedTuple):
 
 
 def forecast_grip(robot: RobotConfig, mirror: Mirror) -> GripForecast:
-    """By the configuration of the robot, at the centre of the panel that needs most."""
+    """Forecast from the robot's configuration, at the centre of the panel that needs most thrust."""
     places = [DeckPose(panel.x_m, panel.y_m, 0.0) for panel in mirror.panels.values()]
     needs = [(least_thrust_n(robot, mirror.gravity_in_robot(place), turns=True), place) for place in places]
     least_n, place = max(needs, key=lambda need: need[0])
@@ -114,7 +115,7 @@ def forecast_grip(robot: RobotConfig, mirror: Mirror) -> GripForecast:
 
 
 def safe_speed_m_s(robot: RobotConfig, gravity: Vector3, thrust_n: float) -> float:
-    """Speed from which the grip that the slope leaves stops the robot within an overrun of 30 mm; 0: it cannot stop."""
+    """Speed from which the robot stops within 30 mm by the grip that the slope leaves; 0: it cannot stop."""
     tangential, outward, to_rear = _load_n(robot, gravity, turns=True)
     spare_n = robot.friction * _wheels_n(robot, thrust_n - outward, to_rear) - tangential
     return sqrt(2.0 * max(spare_n, 0.0) / robot.mass_kg * _STOP_WAY_M)
@@ -127,9 +128,9 @@ def _wheels_n(robot: RobotConfig, pressed_n: float, to_rear_n: float) -> float:
 
 
 class TurnCreep:
-    """Creep of a turn at one heading over its mean of all headings, by the law of ``friction_by_creep``.
+    """Creep of a turn at one heading, divided by its mean over all headings, by the law of ``friction_by_creep``.
 
-    With the thrust that a turn gets; tyres creep as if they had 0.8 of their friction.
+    The thrust is that of a turn. Tyres creep as if they had 0.8 of their friction.
     """
 
     def __init__(self, robot: RobotConfig) -> None:
@@ -137,7 +138,7 @@ class TurnCreep:
         self._slopes: dict[tuple[int, bool], tuple[float, float, float]] = {}
 
     def share(self, gravity: Vector3) -> float:
-        """At the heading that has gravity (unit vector, robot frame) in this direction; 1 where wheels lift."""
+        """Ratio at the heading with this gravity (unit vector, robot frame); 1 if the wheels lift."""
         x, y, z = gravity
         tilt = hypot(x, y)
         key = round(tilt / _TILT_STEP), z > 0.0
@@ -148,9 +149,9 @@ class TurnCreep:
         return _creep(level + swing * x / tilt) / mean if mean else 1.0
 
     def _law(self, tilt: float, *, overhangs: bool) -> tuple[float, float, float]:
-        """Friction over its use with downhill aside, how that grows until it is ahead, mean creep; 0: none, or lifts.
+        """Friction over used friction with downhill to the side, its increase with downhill ahead, and the mean creep.
 
-        ``tilt``: sine of the angle between the surface and the horizontal.
+        The mean creep is 0 if the wheels lift. ``tilt``: sine of the angle between surface and horizontal.
         """
         robot, height = self._robot, sqrt(max(1.0 - tilt * tilt, 0.0))
         gravity = tilt, 0.0, height if overhangs else -height
@@ -164,24 +165,24 @@ class TurnCreep:
 
 
 def _creep(per_use: float) -> float:
-    """U / sqrt(1 - u^2) of a share u = 1 / ``per_use`` of the friction."""
+    """The law u / sqrt(1 - u^2) for the used part u = 1 / ``per_use`` of the friction."""
     share = min(1.0 / per_use, _MOST_SHARE) if per_use > 0.0 else _MOST_SHARE
     return share / sqrt(1.0 - share * share)
 
 
 def _used(robot: RobotConfig, gravity: Vector3, thrust_n: float, headings_rad: Sequence[float]) -> list[float]:
-    """Load along the surface by load of the wheels, with downhill so far from straight behind; < 0: they lift."""
+    """Load along the surface over load of the wheels, by the angle of downhill from behind; < 0: the wheels lift."""
     tangential, outward, _ = _load_n(robot, gravity, turns=True)
     loads_n = [_wheels_n(robot, thrust_n - outward, tangential * cos(to_rear)) for to_rear in headings_rad]
     return [tangential / load_n if load_n > 0.0 else -1.0 for load_n in loads_n]
 
 
 def friction_by_creep(robot: RobotConfig, gravity: Vector3, thrust_n: float, creep_m_rad: float) -> float | None:
-    """Friction of tyres that creep so far downhill for each radian turned on the spot; None on too little slope.
+    """Friction of tyres that creep downhill by ``creep_m_rad`` per radian of a turn in place; None on too little slope.
 
-    The forces that a pivoting contact can take lie in an ellipsoid, and it slides along the normal of that (Howe and
-    Cutkosky 1996): with the share u of its friction in use it creeps by tyre_m u / sqrt(1 - u^2) for each radian. Mean
-    over all headings.
+    The forces of a pivoting contact are limited by an ellipsoid, and the contact slides along its normal (Howe and
+    Cutkosky 1996): using the part u of its friction, it creeps by tyre_m u / sqrt(1 - u^2) per radian. Mean over all
+    headings.
     """
     used = _used(robot, gravity, thrust_n, _HEADINGS_RAD)
     if min(used) < 0.0:
@@ -191,7 +192,7 @@ def friction_by_creep(robot: RobotConfig, gravity: Vector3, thrust_n: float, cre
         creeps = (robot.tyre_m * use / sqrt(friction * friction - use * use) for use in used)
         return sum(creeps) / len(used) - creep_m_rad
 
-    least = 1.001 * max(used)  # it holds
+    least = 1.001 * max(used)  # the robot did not slide
     if not _LEAST_USE < least < _MOST_FRICTION or robot.tyre_m == 0.0:
         return None
     if excess_m_rad(_MOST_FRICTION) > 0.0:
@@ -200,12 +201,12 @@ def friction_by_creep(robot: RobotConfig, gravity: Vector3, thrust_n: float, cre
 
 
 class ThrustControl:
-    """The duty of both fans, never below the configured one: by the slope and the manoeuvre, with a ramp.
+    """Sets the duty of both fans by slope and manoeuvre, with a ramp, never below the configured duty.
 
-    ``duty``: (left, right) as last commanded. While the robot stands it has the thrust for a turn already.
-    ``friction``: of the tyres by the creep of turns, 0 before the first. ``margin``: full thrust over the least that
-    holds the robot on all of the mirror, 0 likewise: with the configured friction, as long as 1.8 times the creep that
-    it explains is not exceeded, and with less beyond that.
+    ``duty``: last command (left, right). A standing robot already gets the thrust for a turn. ``friction``: of the
+    tyres, from the creep of turns; 0 before the first measurement. ``margin``: full thrust over the least that holds
+    the robot on the whole mirror; 0 likewise. It uses the configured friction while the creep is at most 1.8 times the
+    creep expected from it, and a smaller one otherwise.
     """
 
     def __init__(self, robot: RobotConfig, mirror: Mirror) -> None:
@@ -218,12 +219,12 @@ class ThrustControl:
         self._heading_rad, self._turned_rad, self._creep_m_rad = mirror.base_pose.heading_rad, 0.0, 0.0
 
     def give_all(self) -> bool:
-        """Full duty from now on; whether that is new."""
+        """Full duty from now on; returns whether this is a change."""
         is_new, self._is_full, self.duty = not self._is_full, True, (1.0, 1.0)
         return is_new
 
     def step(self, t_s: float, pose: DeckPose, *, turns: bool) -> bool:
-        """Set the duty for now; ``turns``: the robot turns, or may at any time. Whether it has changed."""
+        """Set the duty; returns whether it has changed. ``turns``: the robot turns, or may turn at any time."""
         elapsed_s = 0.0 if self._t_s is None else t_s - self._t_s
         robot, self._t_s = self._robot, t_s
         self._turned_rad += abs(difference(pose.heading_rad, self._heading_rad))
@@ -244,9 +245,9 @@ class ThrustControl:
         return self.duty != before
 
     def measure_grip(self, fixes: int, pose: DeckPose, creep_m_rad: float) -> bool:
-        """After each fix, the number of which is ``fixes``: what the turn before it shows; whether it was a new one.
+        """Update friction and margin from the turn before fix number ``fixes``; returns whether there was a new value.
 
-        ``creep_m_rad``: downhill, as estimated for each radian of a turn.
+        ``creep_m_rad``: estimated downhill creep per radian of a turn.
         """
         if fixes == self._fixes:
             return False

@@ -1,6 +1,6 @@
-"""Turn-and-move waypoint tracking, thesis 3.3.1 and fig. 3.3: a leg, and each of its quantities brought to zero.
+"""Turn-and-move waypoint tracking, thesis 3.3.1 and fig. 3.3: a leg is a turn in place and a straight drive.
 
-A quantity follows a profile with feed-forward, or the thesis's PID (eq. 3.4, in seconds).
+The remaining angle or distance follows a profile with feed-forward, or the thesis's PID (eq. 3.4, in seconds).
 """
 
 from enum import StrEnum
@@ -16,7 +16,7 @@ from ccatp.core import Predicted, Twist, wrap_pi
 
 
 class PidState(msgspec.Struct, frozen=True):
-    """Memory of a PID between two steps."""
+    """State of a PID between two steps."""
 
     integral: float = 0.0
     derivative: float = 0.0
@@ -36,7 +36,7 @@ class Pid:
         self._output_limit = output_limit
 
     def step(self, memory: PidState, error: float, dt_s: float) -> tuple[PidState, float]:
-        """The next memory, and the output within its limit, ``dt_s`` > 0 after the last step."""
+        """The next state, and the limited output, ``dt_s`` > 0 after the last step; ``ValueError`` otherwise."""
         if dt_s <= 0.0:
             raise ValueError(f"dt of a control step must be positive, got {dt_s} s")
         integral, derivative, last_error = memory.integral, memory.derivative, memory.last_error
@@ -49,7 +49,7 @@ class Pid:
         free = self._kp * error + self._kd * derivative
         output = free + grown
         limit = self._output_limit
-        # Integrating further into a saturated output would only have to be undone later.
+        # Anti-windup: no further integration into a saturated output.
         if abs(output) <= limit or abs(free + grown) < abs(free + integral):
             integral = grown
         return PidState(integral, derivative, error), max(-limit, min(limit, free + integral))
@@ -102,15 +102,15 @@ def lag_feed_forward(now: float, after: float, dt_s: float, lag_s: float) -> flo
     return now + (after - now) / (1.0 - exp(-dt_s / lag_s))
 
 
-# What feedback may add to the planned speed, as part of the limit: more would outrun the gate's headroom.
+# Largest speed that feedback may add, as a part of the limit, so that the sum stays within the gate's headroom.
 FEEDBACK_SHARE = 0.25
 
 
 class AxisState(msgspec.Struct, frozen=True):
-    """Progress of a motion: position and speed ``planned`` for now, its bang-bang time ``duration_s``.
+    """Progress of a motion: planned (position, speed) at ``t_s``, and the bang-bang time ``duration_s``.
 
-    ``profile`` ends at ``duration_s``: the last of a motion that was planned more than once.
-    ``slip``: the share by which the wheels travel further than the body.
+    ``profile`` ends at ``duration_s``; a motion may be planned again.
+    ``slip``: part by which the wheels travel further than the body.
     """
 
     duration_s: float
@@ -122,19 +122,19 @@ class AxisState(msgspec.Struct, frozen=True):
 
 
 class BareAxis:
-    """PID of the remaining quantity, thesis eqs 3.1 to 3.4; ``a_max`` only serves the bang-bang time."""
+    """PID of the remaining quantity, thesis eqs 3.1 to 3.4; ``a_max`` is used only for the bang-bang time."""
 
     def __init__(self, gains: PidConfig, v_max: float, a_max: float) -> None:
         self._pid = Pid(gains, v_max)
         self._v_max, self._a_max = v_max, a_max
 
     def begin(self, remaining: float) -> AxisState:
-        """Start; such a motion has no plan, and is overtime at once."""
+        """Start a motion, which has no plan: its planned time is over at once."""
         profile = Profile.rest_to_rest(remaining, self._v_max, self._a_max)
         return AxisState(profile.duration_s, profile, t_s=profile.duration_s)
 
     def is_over(self, _motion: AxisState, remaining: float, tolerance: float, _speed: float | None) -> bool:
-        """Whether it is within tolerance, however fast."""
+        """Whether the rest is within tolerance, at any speed."""
         return abs(remaining) <= tolerance
 
     def step(self, motion: AxisState, remaining: float, dt_s: float, _speed: float | None) -> tuple[AxisState, float]:
@@ -144,14 +144,14 @@ class BareAxis:
 
 
 class ProfiledAxis:
-    """Follows a rest-to-rest profile x*(t) over what remained at its beginning.
+    """Follows a rest-to-rest profile x*(t) over the distance that remained at its start.
 
     With the tracking error e = remaining - (distance - x*) the set point is
 
         u = (1 + s) ff(v*) + Kp e + Kd (v* - v),    ds/dt = Kp e v* / (v_max^2 tau).
 
-    ff takes the servo's lag T out: T e'' + (1 + Kd) e' + Kp e = 0. s, the share of slip, acts in proportion to the
-    planned speed and is gone at the end. Kp e is bounded; a plan that ends far off is followed by a second motion.
+    ff compensates the servo's lag T: T e'' + (1 + Kd) e' + Kp e = 0. The slip s acts in proportion to the planned
+    speed, and so ends with it. Kp e is bounded; if a plan ends far off, a second motion follows.
     """
 
     def __init__(self, gains: PidConfig, cfg: ControlConfig, v_max: float, a_max: float, lag_s: float) -> None:
@@ -168,21 +168,21 @@ class ProfiledAxis:
         return AxisState(profile.duration_s, profile)
 
     def is_over(self, motion: AxisState, remaining: float, tolerance: float, speed: float | None) -> bool:
-        """Whether the plan is out and what is left when the wheels have run down is within ``tolerance``."""
+        """Whether the plan is over, and the rest after the wheels have run down is within ``tolerance``."""
         if motion.t_s < motion.duration_s:
             return False
         coast = 0.0 if speed is None else speed * self._lag_s
         return abs(remaining - coast) <= tolerance
 
     def _renewed_if_far(self, motion: AxisState, remaining: float) -> AxisState:
-        """Planned again where the plan ended further off than feedback can bring it in time."""
+        """Plan again if the plan ended further off than feedback can correct in time."""
         if motion.t_s < motion.duration_s or abs(remaining) <= 0.5 * self._feedback_limit * self._stop_time_s:
             return motion
         profile = Profile.rest_to_rest(remaining, self._v_max, self._a_max)
         return AxisState(motion.t_s + profile.duration_s, profile, motion.t_s)
 
     def step(self, motion: AxisState, remaining: float, dt_s: float, speed: float | None) -> tuple[AxisState, float]:
-        """The motion ``dt_s`` later, and its set point until then, in the unit of the quantity per s."""
+        """The motion ``dt_s`` later, and the set point until then, m/s or rad/s."""
         motion = self._renewed_if_far(motion, remaining)
         profile, (position, now), t_s = motion.profile, motion.planned, motion.t_s + dt_s
         planned = profile.at(t_s - (motion.duration_s - profile.duration_s))
@@ -196,14 +196,14 @@ class ProfiledAxis:
         return AxisState(motion.duration_s, profile, t_s, planned, slip), set_point
 
 
-# Drift per metre beyond which an estimate is nonsense: a robot carried off that fast has lost its wheels' grip.
+# Largest plausible drift per metre: beyond it the wheels have lost their grip.
 CREEP_LIMIT = 0.3
 Vector2 = tuple[float, float]
 Speeds = Twist | Predicted | None
 
 
 class LegView(msgspec.Struct, frozen=True):
-    """The line from the robot, ``beside_m`` to the left of it; ``gain``: progress per metre that the wheels drive."""
+    """The robot relative to its line: rest of the way, offset to the left, heading error, progress per driven metre."""
 
     ahead_m: float
     beside_m: float
@@ -212,11 +212,11 @@ class LegView(msgspec.Struct, frozen=True):
 
 
 class LegLine(msgspec.Struct, frozen=True):
-    """The straight line through the stop along which a leg is driven, held by its course alone.
+    """The straight line through the stop along which a leg is driven, defined by its course.
 
-    So it passes through the stop wherever an update moves that. A stop whose coordinates change is one seen in another
-    frame: from afar the line is laid again from the robot to the stop; nearer than the look-ahead it keeps its angle to
-    the robot, because the bearing of a near stop is noise.
+    It always passes through the stop. When the stop's coordinates change, the frame has changed. Then a line to a far
+    stop starts again at the robot; nearer than the look-ahead it keeps its angle to the robot, because the bearing of a
+    near stop is mostly noise.
     """
 
     target: Vector2
@@ -227,7 +227,7 @@ class LegLine(msgspec.Struct, frozen=True):
 
     @classmethod
     def lay(cls, target: Vector2, course_rad: float) -> "LegLine":
-        """The line through a stop with a course."""
+        """The line through a stop with a given course."""
         return cls(target, course_rad, cos(course_rad), sin(course_rad))
 
     @classmethod
@@ -238,7 +238,7 @@ class LegLine(msgspec.Struct, frozen=True):
     def look(
         self, pose: Pose, target: Vector2, creep: Vector2, reverse: bool, lookahead_m: float
     ) -> "tuple[LegLine, LegView]":
-        """Where the robot at ``pose`` = (x, y, heading) stands, and the line as it is from now on.
+        """The line for the next steps, and the robot at ``pose`` = (x, y, heading) relative to it.
 
         The body moves along its axis m and drifts by c per metre: (m + c) lies along the line when the part of m across
         it cancels that of c, ``sin(crab) = -c_across``; progress is ``cos(crab) + c_along``.
@@ -261,7 +261,7 @@ class LegLine(msgspec.Struct, frozen=True):
 
 
 def crab(course_rad: float, creep: Vector2) -> float:
-    """Angle by which the body has to point beside a course so that it is not carried off it, rad."""
+    """Angle between body and course that compensates the drift, rad."""
     across = cos(course_rad) * creep[1] - sin(course_rad) * creep[0]
     return -asin(min(max(across, -CREEP_LIMIT), CREEP_LIMIT))
 
@@ -277,17 +277,17 @@ def line_rate(sight: LegView, v_m_s: float, cross_gain_rad_m2: float, heading_we
     return -gain * sight.beside_m - sqrt(heading_weight_1_s2 + 2.0 * gain * v_m_s) * sight.off_rad
 
 
-# Further off the bearing than this an unshaped drive stops and aligns again: the thesis aligns first, then heads on.
+# Bearing error at which an unshaped drive stops and aligns again, as in the thesis.
 REALIGN_RAD = 0.5
-# A stop so near whose bearing moves by more than REALIGN_RAD in a turn is as good as reached: the turn itself shifts
-# the robot by millimetres, and would chase a bearing that runs away from it.
+# A stop nearer than this whose bearing changes by more than REALIGN_RAD in a turn counts as reached: the turn itself
+# moves the robot by millimetres, so it would never reach the bearing.
 ALL_BUT_THERE_M = 0.01
 NO_CREEP = (0.0, 0.0)
 STILL = Twist(0.0, 0.0)
 
 
 class LegPhase(StrEnum):
-    """What a leg is at."""
+    """Phase of a leg."""
 
     TURN = "turn"
     DRIVE = "drive"
@@ -298,9 +298,9 @@ TURN, DRIVE, DONE = LegPhase
 
 
 class LegMotion(msgspec.Struct, frozen=True):
-    """Progress of a leg or of a turn in place, as ``LegTracker`` makes it.
+    """Progress of a leg or of a turn in place, made by ``LegTracker``.
 
-    ``axis``: the turn or the way along the line, by ``phase``; ``aim``: stop and heading for which a turn began.
+    ``axis``: the turn or the drive along the line, by ``phase``; ``aim``: stop and heading at the start of a turn.
     """
 
     phase: LegPhase
@@ -334,9 +334,9 @@ class _Pace:
 class LegTracker:
     """Drives one leg: turn in place to the bearing of the target, then move to it, forward or in reverse.
 
-    Pose, target and creep (drift per metre of travel) are in one plane, which may change from step to step. A shaped
-    set of gains drives along the line from where the drive begins; the thesis's heads for the stop. ``slow_limits``: of
-    motions that begin with ``is_slow``.
+    Pose, target and creep (drift per metre of travel) are in one plane, which may change from step to step. With a
+    shaped set of gains the robot follows the line from the start of the drive; with the thesis's gains it heads for the
+    stop. ``slow_limits``: for motions that begin with ``is_slow``.
     """
 
     def __init__(
@@ -355,7 +355,7 @@ class LegTracker:
     ) -> LegMotion:
         """Start a leg from ``pose``."""
         if hypot(target[0] - pose[0], target[1] - pose[1]) <= self._position_tolerance_m:
-            # It is there, and the bearing of a stop so near is noise.
+            # The stop is reached, and the bearing of such a near stop is noise.
             return LegMotion(DONE, is_slow, reverse, self._paces[is_slow].forward.begin(0.0))
         angle = self._bearing_error(pose, target, creep, reverse)
         if abs(angle) > self._straight_rad:
@@ -385,7 +385,7 @@ class LegTracker:
         speeds: Speeds = None,
         creep: Vector2 = NO_CREEP,
     ) -> tuple[LegMotion, Twist]:
-        """The next motion, and the twist for ``dt_s``; ``pose`` is that at which it will take effect."""
+        """The next motion, and the twist for ``dt_s``; ``pose``: where the twist will take effect."""
         if motion.phase is TURN:
             angle = self._bearing_error(pose, target, creep, motion.reverse)
             rate_rad_s = None if speeds is None else speeds.omega_rad_s
@@ -413,7 +413,7 @@ class LegTracker:
     def _look_at_bearing(
         self, motion: LegMotion, pose: Pose, target: Vector2, angle_rad: float
     ) -> tuple[LegMotion, bool]:
-        """Whether a stop that is all but reached lies on another bearing than the turn began for (same frame)."""
+        """Whether the bearing of a very near stop has run away since the turn began (in the same frame)."""
         if hypot(target[0] - pose[0], target[1] - pose[1]) > ALL_BUT_THERE_M:
             return motion, False
         aimed_at, heading_rad = motion.aim
@@ -428,7 +428,7 @@ class LegTracker:
     def _bearing_error(self, pose: Pose, target: Vector2, creep: Vector2, reverse: bool) -> float:
         """Thesis eq. 3.2, e = beta - theta with beta = atan2(dy, dx); printed there with the arguments exchanged.
 
-        In reverse the tail has to point at the target; against a drift the robot points beside it.
+        In reverse the tail points at the target. A shaped drive adds the angle that compensates the drift.
         """
         beta = atan2(target[1] - pose[1], target[0] - pose[0])
         beta += crab(beta, creep) if self._shaped else 0.0

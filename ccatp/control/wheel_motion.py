@@ -1,4 +1,4 @@
-"""Motion of the wheels: where the drives that were sent lead, what the encoders report, if the gyroscope agrees."""
+"""Motion of the wheels: prediction from the sent drives, means of the encoder samples, plausibility of the IMU."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -9,21 +9,21 @@ from ccatp.core import ImuSample, Predicted, WheelSample
 
 Pose = tuple[float, float, float]
 
-# A delay below a thousandth of a frame is rounding of the robot's clock.
+# A delay below a thousandth of a frame is a rounding error of the robot's clock.
 ROUNDING = 1e-3
-# A robot whose echo is older than its own time-to-live holds its wheels: beyond that nothing is on the way any more.
+# Longest time for which a sent drive can still take effect: after its time-to-live the robot holds its wheels.
 REACH_S = 0.25
 
 
 class SentDrives:
-    """Carries a frame's estimate forward over the drives that are on their way to the wheels.
+    """Predicts the state of a frame over the drives that were sent but have not acted yet.
 
-    The echo shows which drive was in force last and for how long; those sent after it follow one per frame. Each wheel
-    is a first-order servo, so with a set point u over t
+    The echo shows the drive in force and its age; the drives sent after it follow one per frame. Each wheel is a
+    first-order servo, so with a set point u for a time t
 
         v(t) = u + (v - u) exp(-t/T),    mean = u + (v - u) (T/t) (1 - exp(-t/T)).
 
-    ``newest``, ``rates``: number and set points (right, left), rad/s, of the drive that was sent last.
+    ``newest``, ``rates``: number and set points (right, left), rad/s, of the last drive sent.
     """
 
     def __init__(self, robot: RobotConfig, frame_s: float) -> None:
@@ -34,7 +34,7 @@ class SentDrives:
         self.begin_session(frame_s)
 
     def begin_session(self, frame_s: float) -> None:
-        """Frames come every ``frame_s``; no drive of the last session is still to act."""
+        """Begin a session with frames every ``frame_s``, and drop the drives of the last one."""
         if frame_s <= 0.0:
             raise ValueError(f"frame_s = {frame_s}: the period of the frames must be positive")
         self._frame_s = frame_s
@@ -42,7 +42,7 @@ class SentDrives:
         self._sent: deque[tuple[int, float, float]] = deque(maxlen=max(1, round(REACH_S / frame_s)))
 
     def add(self, seq: int, right_rad_s: float, left_rad_s: float) -> None:
-        """Drive ``seq`` was sent; a number that is not newer begins a new row."""
+        """Record drive ``seq``; a number that is not newer drops the earlier drives."""
         sent = self._sent
         if sent and seq <= sent[-1][0]:
             sent.clear()
@@ -59,7 +59,10 @@ class SentDrives:
             self._left_high = left_rad_s
 
     def take_span(self) -> tuple[float, float, float, float]:
-        """Lowest and highest rate of right and left wheel since the last call, rad/s, the drive in force included."""
+        """Lowest and highest set points of the right, then the left wheel since the last call, rad/s.
+
+        The drive in force at the last call is included.
+        """
         span = self._right_low, self._right_high, self._left_low, self._left_high
         self._right_low = self._right_high = self.rates[0]
         self._left_low = self._left_high = self.rates[1]
@@ -75,10 +78,10 @@ class SentDrives:
         is_held: bool,
         creep: tuple[float, float] = (0.0, 0.0),
     ) -> Predicted:
-        """The state in which the next command will find the robot; ``creep``: drift per metre in the plane of ``pose``.
+        """The state when the next command takes effect. ``creep``: drift per metre, in the plane of ``pose``.
 
-        ``echo_seq`` is the drive in force (0: none) and ``echo_age_s`` its age; wheels of a robot that ``is_held`` run
-        down whatever was sent.
+        ``echo_seq``: the drive in force (0: none); ``echo_age_s``: its age. If ``is_held``, the wheels run down
+        whatever was sent.
         """
         sent, frame_s = self._sent, self._frame_s
         while len(sent) > 1 and sent[1][0] <= echo_seq:
@@ -88,7 +91,7 @@ class SentDrives:
         for seq, v_sent, omega_sent in sent:
             if seq > echo_seq:
                 dt_s, keep, mean = self._frame
-            else:  # the one in force
+            else:  # the drive in force
                 dt_s = frame_s - echo_age_s
                 if dt_s <= ROUNDING * frame_s:
                     continue
@@ -103,7 +106,7 @@ class SentDrives:
 
 
 def _servo(lag_s: float, dt_s: float) -> tuple[float, float]:
-    """Shares of the difference to the set point: what is left after ``dt_s``, and its mean on the way."""
+    """Part of the difference from the set point after ``dt_s``, and its mean over ``dt_s``."""
     if lag_s <= 0.0:
         return 0.0, 0.0
     keep = exp(-dt_s / lag_s)
@@ -111,11 +114,11 @@ def _servo(lag_s: float, dt_s: float) -> tuple[float, float]:
 
 
 MotionSum = tuple[float, float, float, float]
-"""Time, s; running sums since the start: way of right and left wheel, m, turn by the gyroscope where plausible, rad."""
+"""Time, s; sums since the start: travel of right and left wheel, m, turn by the gyroscope where plausible, rad."""
 
 
 class SlidingWindow:
-    """The change of running sums over a time."""
+    """The change of running sums over a period."""
 
     __slots__ = ("_kept", "_span_s")
 
@@ -124,11 +127,11 @@ class SlidingWindow:
         self._kept: deque[MotionSum] = deque()
 
     def reset(self) -> None:
-        """Empty again."""
+        """Drop all sums."""
         self._kept.clear()
 
     def push(self, now: MotionSum) -> MotionSum | None:
-        """Take the newest sums; the change over the span (its time is the length), ``None`` while it is shorter."""
+        """Take the newest sums; returns the change over the period, with its length, ``None`` while it is too short."""
         kept, since_s = self._kept, now[0] - self._span_s
         kept.append(now)
         while len(kept) > 1 and kept[1][0] <= since_s:
@@ -140,7 +143,7 @@ class SlidingWindow:
 
 
 class WheelMeans:
-    """Mean wheel rates over a frame (``None`` without samples), and the yaw rate, smoothed over some frames."""
+    """Mean wheel rates of a frame (``None`` without samples), and the smoothed yaw rate of the wheels."""
 
     _SMOOTH_S = 0.05
 
@@ -183,12 +186,12 @@ class WheelMeans:
 
 
 def as_standing(samples: Sequence[WheelSample]) -> list[WheelSample]:
-    """What the encoders would say of wheels that stand: for a robot that is held and whose encoders are in doubt."""
+    """Samples of standing wheels, for a held robot whose encoders are not trusted."""
     return [WheelSample(sample.t_s, 0.0, 0.0) for sample in samples]
 
 
 def largest_rate_rad_s(robot: RobotConfig) -> float:
-    """No wheel turns faster, rad/s: an encoder that says so is wrong. A count more per sample is no contradiction."""
+    """Largest plausible encoder rate, rad/s; it allows for one count too many per sample."""
     return 3.0 * robot.max_wheel_rad_s
 
 
@@ -196,11 +199,11 @@ _STILL_RAD_S = 0.02  # yaw rate of wheels that stand
 
 
 class ImuGate:
-    """Leaves out the inertial unit while its readings are impossible, and for a quarantine afterwards.
+    """Rejects the inertial unit while its readings are impossible, and for a quarantine time afterwards.
 
-    Impossible: an acceleration or a rate beyond what the robot can do; a rate that jumps away from the wheels' (of one
-    that drifts away ``ccatp.safety.wheel_monitors`` decides); exact repetition by a unit that has shown noise at rest.
-    ``cause`` is empty and ``out_since_s`` infinite while the unit is used.
+    Impossible are: an acceleration or rate that the robot cannot reach; a rate that jumps away from that of the wheels
+    (``ccatp.safety.wheel_monitors`` judges a slow drift); exact repetition by a unit that has shown noise at rest.
+    While the unit is used, ``cause`` is empty and ``out_since_s`` infinite.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
@@ -220,7 +223,7 @@ class ImuGate:
         self.out_since_s = inf
 
     def admit(self, samples: Sequence[ImuSample], yaw_rad_s: float) -> Sequence[ImuSample]:
-        """The usable ones of a frame's samples, oldest first: all or none."""
+        """The usable samples of a frame, oldest first: all or none."""
         limit = self._rate + self._share * (yaw_rad_s if yaw_rad_s >= 0.0 else -yaw_rad_s)
         is_good = True
         for t_s, ax, wz in samples:
