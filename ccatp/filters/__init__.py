@@ -12,4 +12,4 @@ FILTERS: dict[str, Callable[[FloatArray, FloatArray], Filter]] = {
     "ekf": KalmanFilter,
     "ukf": UnscentedKalmanFilter,
 }
-"""Constructors of (mean (n,), covariance (n, n)); for linear models, ``kf`` and ``ekf`` are one."""
+"""Constructors from (mean (n,), covariance (n, n)). ``kf`` and ``ekf`` are the same class."""

@@ -1,4 +1,4 @@
-"""What every filter offers: the ``Filter`` protocol, the innovation of an update, typed refusals."""
+"""The interface of the filters: the ``Filter`` protocol, the innovation of an update, the errors."""
 
 from typing import Protocol
 
@@ -9,11 +9,11 @@ from ccatp.core import FloatArray
 
 
 class FilterError(Exception):
-    """Base of every refusal of a filter. The state before the refused call stays in force."""
+    """Base of the errors of a filter. The state remains that before the failed call."""
 
 
 class FilterShapeError(FilterError):
-    """An array does not fit the state: carries its name and its shape; the message has the shape wanted."""
+    """An array does not fit the state; has its name and shape. The message has the required shape."""
 
     def __init__(self, name: str, shape: tuple[int, ...], wanted: str) -> None:
         super().__init__(f"{name} has shape {shape}, wanted {wanted}")
@@ -22,17 +22,16 @@ class FilterShapeError(FilterError):
 
 
 class FilterDiverged(FilterError):
-    """A mean, a covariance or a noise is not a finite Gaussian: the message says which."""
+    """A mean, covariance or noise is not that of a finite Gaussian; the message says which."""
 
 
 class Innovation(msgspec.Struct, frozen=True, gc=False):
-    """What an update found.
+    """Residual and consistency of an update.
 
-    ``nis`` is nu^T (H P H^T + R)^-1 nu of all rows, chi-squared with m degrees of freedom when the filter is
-    consistent.
+    ``nis`` is nu^T (H P H^T + R)^-1 nu of all rows; chi-squared with m degrees of freedom if the filter is consistent.
     """
 
-    rows: list[float]  # costs a third of an array, which few ask for
+    rows: list[float]  # a third of the cost of an array, which is seldom needed
     nis: float
 
     @property
@@ -47,9 +46,9 @@ class Innovation(msgspec.Struct, frozen=True, gc=False):
 
 
 class FilterModel(Protocol):
-    """A nonlinear process model x <- f(x) or measurement model z = f(x) + noise; nothing wraps, nor needs to.
+    """A nonlinear process model x <- f(x) or measurement model z = f(x) + noise; angles are not wrapped.
 
-    The returned arrays are the model's work space: they hold until its next call, and a filter does not change them.
+    The returned arrays belong to the model: they are valid until its next call, and a filter does not change them.
     """
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -62,8 +61,8 @@ class FilterModel(Protocol):
 class Filter(Protocol):
     """A Gaussian filter of n states, thesis fig. 2.8.
 
-    ``mean`` and ``covariance`` return arrays that later calls do not change: a caller that keeps them keeps the state.
-    Between two calls they return the same arrays again.
+    ``mean`` and ``covariance`` return arrays that later calls do not change, so a caller may keep them. Without a
+    change of the state they return the same arrays.
     """
 
     @property
@@ -76,10 +75,7 @@ class Filter(Protocol):
 
     @property
     def transition(self) -> FloatArray:
-        """F of the last prediction, shape (n, n): matrix, Jacobian, or regression by sigma points.
-
-        At first the identity.
-        """
+        """F of the last prediction, shape (n, n): matrix, Jacobian, or regression by sigma points; first identity."""
 
     def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """Advance the state: x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or the same with a nonlinear f.
@@ -90,9 +86,8 @@ class Filter(Protocol):
     def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> Innovation:
         """Condition the state on z = H x + noise (thesis eqs 2.7 to 2.10), or on z = h(x) + noise.
 
-        z (m,), m = 0 leaves the prediction; H (m, n) or a model; R variances (m,) or covariance (m, m). Raises
-        ``FilterShapeError``, and ``FilterDiverged``: posterior not finite, P or R not positive
-        definite.
+        z (m,), m = 0 has no effect; H (m, n) or a model; R variances (m,) or covariance (m, m). Raises
+        ``FilterShapeError``, and ``FilterDiverged``: posterior not finite, P or R not positive definite.
         """
 
     def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
@@ -114,10 +109,7 @@ def check_rows(z: FloatArray, H: FloatArray, R: FloatArray, states: int) -> None
 
 
 def checked_gaussian(mean: FloatArray, covariance: FloatArray, shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
-    """Copies of a mean (n,) and a covariance of ``shape`` (n, n), symmetric to the last bit.
-
-    Raises as ``Filter.reset``.
-    """
+    """Copies of mean (n,) and covariance of ``shape`` (n, n), symmetric to the last bit. Raises as ``Filter.reset``."""
     mean, covariance = np.array(mean, dtype=np.float64), np.array(covariance, dtype=np.float64)
     if mean.ndim != 1 or mean.size == 0:
         raise FilterShapeError("mean", mean.shape, "(n,), n >= 1")
@@ -137,8 +129,8 @@ def checked_gaussian(mean: FloatArray, covariance: FloatArray, shape: tuple[int,
 
 
 ASYMMETRY = 1e-9
-"""Largest relative asymmetry taken for rounding of the caller's arithmetic."""
+"""Largest relative asymmetry that counts as rounding of the caller's arithmetic."""
 HUGE = 1e200
-"""Sums of squares beyond it count as not finite: no product of the numbers below overflows."""
+"""Sums of squares beyond it count as not finite, so that no product of smaller numbers overflows."""
 NEGATIVITY = 1e-9
-"""Largest negative eigenvalue, relative to the largest entry, taken for rounding."""
+"""Largest negative eigenvalue, relative to the largest entry, that counts as rounding."""

@@ -1,4 +1,4 @@
-"""Extended Kalman filter over a vehicle, a shared calibration and a map that grows and shrinks, on arrays."""
+"""Extended Kalman filter of a vehicle, a shared calibration and a map whose landmarks are added and removed."""
 
 from collections.abc import Callable, Hashable, Sequence
 from copy import copy
@@ -19,11 +19,11 @@ BlockId = Hashable
 Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 STRONG = 1e6
-"""Ratio of a row's variance to its noise beyond which P - K S K^T would lose digits: there the Joseph form is used."""
+"""Ratio of a row's variance to its noise beyond which P - K S K^T loses digits, and the Joseph form is used."""
 
 
 class BlockError(FilterError):
-    """A block that is not there, or is there already: carries its identifier."""
+    """A block is not in the state, or is in it already; has its identifier."""
 
     def __init__(self, block: BlockId, what: str) -> None:
         super().__init__(f"block {block!r} {what}")
@@ -31,7 +31,7 @@ class BlockError(FilterError):
 
 
 class Update(NamedTuple):
-    """An ``Innovation``, and whether it was used; the state is unchanged where the gate refused it.
+    """An innovation, and whether the gate accepted it; otherwise the state is unchanged.
 
     ``residual``: z - h(x), (m,); ``nis``: nu^T S^-1 nu; ``size``: m; ``spread``: diagonal of S with the given noise,
     (m,).
@@ -45,7 +45,7 @@ class Update(NamedTuple):
 
 
 class RowUpdate(msgspec.Struct, frozen=True, gc=False):
-    """An ``Update`` of one row as numbers, because arrays of one take longer than the algebra."""
+    """An ``Update`` of one row as numbers, because arrays of one element cost more than the algebra."""
 
     residual: float
     nis: float
@@ -60,12 +60,11 @@ class EkfSlam:
     update:   S = H P H^T + R,  K = P H^T S^-1,  x <- x + K nu,  P <- P - K S K^T
     augment:  b = g(x, z):  P_bx = G_x P,  P_bb = G_x P G_x^T + G_z R G_z^T
 
-    Hevrdejs and Knoll 2017, eqs 1 and 2. H is sparse: a row names its columns, so an update costs one product with
-    those columns and one rank-m subtraction: n^2. The next call changes or replaces ``mean`` and ``covariance``.
+    Hevrdejs and Knoll 2017, eqs 1 and 2. H is sparse and given with its columns, so an update costs one product with
+    these columns and one rank-m subtraction: n^2. The next call changes or replaces ``mean`` and ``covariance``.
 
-    Vehicle mean (v,), covariance (v, v); calibration (c,), (c, c). A shape that does not fit raises
-    ``FilterShapeError``; what is not finite or not positive (semi)definite raises ``FilterDiverged``, here and in all
-    methods.
+    Vehicle mean (v,), covariance (v, v); calibration (c,), (c, c). All methods raise ``FilterShapeError`` for a wrong
+    shape, and ``FilterDiverged`` for values that are not finite or not positive (semi)definite.
     """
 
     def __init__(
@@ -78,7 +77,7 @@ class EkfSlam:
         x, P = checked_gaussian(vehicle_mean, vehicle_covariance, np.shape(vehicle_covariance))
         self.vehicle_size = v = x.size
         row, column = np.ogrid[:v, :v]
-        # Flat places of the upper triangle of (v, v), mirrored: what is taken from them is exactly symmetric.
+        # Flat indices of the upper triangle of (v, v), mirrored, to make a matrix exactly symmetric.
         self._mirrored = v * np.minimum(row, column) + np.maximum(row, column)
         c = 0 if calibration_mean is None else int(np.size(calibration_mean))
         self._blocks: dict[BlockId, slice] = {}
@@ -93,10 +92,10 @@ class EkfSlam:
         v = self.vehicle_size
         self.mean, self.covariance = mean, covariance
         self._rows, self._columns, self._vehicle = covariance[:v], covariance[:, :v], mean[:v]
-        self._transposed = covariance.T  # BLAS writes in place into columns that lie together
+        self._transposed = covariance.T  # BLAS writes in place only into contiguous columns
 
     def __deepcopy__(self, memo: dict[int, object]) -> "EkfSlam":
-        """A filter of its own, its views upon its own state."""
+        """An independent copy, whose views refer to its own state."""
         other = copy(self)
         other._blocks = dict(self._blocks)
         other._take(self.mean.copy(), self.covariance.copy())
@@ -117,7 +116,7 @@ class EkfSlam:
         return block in self._blocks
 
     def block(self, block: BlockId) -> slice:
-        """Where a landmark stands in the state (it moves when one before it is removed); raises ``BlockError``."""
+        """Place of a landmark in the state; a removal of another one may change it. Raises ``BlockError``."""
         try:
             return self._blocks[block]
         except KeyError:
@@ -142,7 +141,7 @@ class EkfSlam:
         self._vehicle[:] = vehicle_mean
 
     def copy_states(self, block: BlockId, start: int) -> None:
-        """A block takes the value of the states from ``start`` on, as many as it has, and all their correlations."""
+        """Copy the states from ``start`` on, with their correlations, into a block."""
         to = self.block(block)
         source, P = slice(start, start + to.stop - to.start), self.covariance
         self.mean[to] = self.mean[source]
@@ -150,7 +149,7 @@ class EkfSlam:
         P[:, to] = P[:, source]
 
     def relax(self, index: int, factor: float, variance: float) -> None:
-        """One state forgets: x <- factor x + noise, a Gauss-Markov process; ``factor`` 0 to 1."""
+        """Predict one state as a Gauss-Markov process: x <- factor x + noise; ``factor`` 0 to 1."""
         n = self.size
         flat = self.covariance.ravel()
         self.mean[index] *= factor
@@ -159,20 +158,18 @@ class EkfSlam:
         flat[index * (n + 1)] += variance
 
     def add_square(self, factor: float, vector: FloatArray) -> None:
-        """P <- P + factor vector vector^T, vector (n,): exactly symmetric where ``factor`` is a power of two."""
-        # All arguments by position: by name they take as long as the algebra. P^T, because BLAS has columns.
+        """P <- P + factor vector vector^T, vector (n,); exactly symmetric if ``factor`` is a power of two."""
+        # Positional arguments, because keywords cost as much as the algebra; P^T, because BLAS stores columns.
         dger(factor, vector, vector, 1, 1, self._transposed, 1, 1, 1)
 
     def update_row(
         self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf, knee: float = inf
     ) -> RowUpdate:
-        """Condition on one row: ``columns`` (k,), each once; derivatives ``h`` (k,); residual z - h(x).
+        """Condition on one row: different ``columns`` (k,), derivatives ``h`` (k,), residual z - h(x), variance ``r``.
 
-        Noise variance ``r``.
-
-        ``gate``: largest normalised innovation squared that is used. ``knee``: innovations beyond that many sigmas get
-        a noise so much larger that they weigh as those at the knee (Huber's loss, one step of reweighting); the NIS is
-        with that noise.
+        ``gate``: largest normalised innovation squared that is used. ``knee``: the noise of an innovation beyond this
+        many sigmas is increased until it has the weight of one at the knee (Huber's loss, one step of reweighting). The
+        NIS is that with the increased noise.
         """
         cross = h.dot(self.covariance.take(columns, axis=0))
         s = given = ddot(h, cross[columns]) + r
@@ -195,10 +192,7 @@ class EkfSlam:
         return RowUpdate(residual, nis, True, given)
 
     def update(self, columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray, gate: float = inf) -> Update:
-        """Condition on m rows at once: ``columns`` (k,), each once; H (m, k); residual (m,).
-
-        R (m, m) or variances (m,).
-        """
+        """Condition on m rows: different ``columns`` (k,); H (m, k); residual (m,); R (m, m) or variances (m,)."""
         R = _checked_rows(columns, H, residual, R)
         cross, S = self._moments(columns, H, R)
         root = _root(S, residual)
@@ -248,10 +242,10 @@ class EkfSlam:
         J_z: FloatArray | None = None,
         R: FloatArray | None = None,
     ) -> None:
-        """A landmark joins by the inverse measurement model b = g(x, z): ``mean`` is g, shape (b,).
+        """Add a landmark by the inverse measurement model b = g(x, z); ``mean`` is g, shape (b,).
 
-        ``J_state``: dg/dx over ``columns``, (b, k); ``J_z``: dg/dz, (b, m), None where nothing was measured (a copy of
-        states); R (m, m). Raises ``BlockError`` where the landmark exists.
+        ``J_state``: dg/dx over ``columns``, (b, k); ``J_z``: dg/dz, (b, m), None without a measurement (a copy of
+        states); R (m, m). Raises ``BlockError`` if the landmark exists.
         """
         if block in self._blocks:
             raise BlockError(block, "is in the state already")
@@ -274,7 +268,7 @@ class EkfSlam:
         self._take(grown, P)
 
     def remove(self, *blocks: BlockId) -> None:
-        """Marginalise landmarks: their rows and columns go; raises ``BlockError``."""
+        """Marginalise landmarks: remove their rows and columns. Raises ``BlockError``."""
         keep = np.ones(self.size, dtype=np.bool_)
         for block in blocks:
             keep[self.block(block)] = False

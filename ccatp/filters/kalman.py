@@ -1,7 +1,7 @@
 """Linear and extended Kalman filter, thesis eqs 2.5 to 2.13, for any number of states and measurements.
 
-Matrices are small: a step is a dozen calls of BLAS and LAPACK into buffers that are kept, with positional arguments in
-the order of ``scipy.linalg.blas``: keywords cost three times what a product of 4 x 4 costs.
+The matrices are small. A step is a dozen calls of BLAS and LAPACK into reused buffers. Arguments are positional, in the
+order of ``scipy.linalg.blas``, because keywords cost three times as much as a product of 4 x 4.
 """
 
 import numpy as np
@@ -22,17 +22,17 @@ from ccatp.filters.base import (
 )
 
 STRONGEST = 3e3
-"""Largest variance of a row over its noise at which the prior is simply subtracted: it costs that many digits, and the
-same number bounds what rows that nearly repeat each other cost. Beyond it a QR factorisation does the update."""
+"""Largest ratio of a row's variance to its noise for an update by subtraction, which loses digits by this factor; so do
+rows that nearly repeat each other. Beyond it the update uses a QR factorisation."""
 MANY = 32
-"""Rows beyond which a QR factorisation costs less than one of S."""
+"""Number of rows beyond which a QR factorisation costs less than one of S."""
 
 
 class _Rows:
-    """Buffers for m measurement rows: H^T above zeros (n + 1, m), V (n + 1, m), S (m, m), and arguments of their calls.
+    """Buffers for m measurement rows: H^T above zeros (n + 1, m), V (n + 1, m), S (m, m), and the arguments of BLAS.
 
-    V is P H^T above the residual nu^T, in the end P H^T C^-T above (C^-1 nu)^T, with S = H P H^T + R = C C^T. More than
-    four rows are filled up with empty ones to a multiple of four, which BLAS computes faster.
+    V is P H^T above the residual nu^T, and later P H^T C^-T above (C^-1 nu)^T, with S = H P H^T + R = C C^T. More than
+    four rows are padded with zero rows to a multiple of four, which BLAS computes faster.
     """
 
     def __init__(self, n: int, m: int, M: FloatArray, U: FloatArray) -> None:
@@ -64,15 +64,15 @@ class KalmanFilter:
 
     The printed form of 2.10 loses symmetry and then definiteness by rounding. With S = H P H^T + R = C C^T,
     V = P H^T C^-T and y = C^-1 nu the same posterior is x + V y, P - V V^T, and y^T y is the normalised innovation
-    squared. Mean and covariance are kept as one matrix M = [P -x; -x^T c]: a product with M is one with P and one
-    with x, and one product, of V above y^T, gives all three results. The corner c meets nothing but zeros. The upper
-    triangle of M is P: a prediction reads no other, so that the two halves differ by no more than one prediction and
-    the updates after it round. General products are used elsewhere: BLAS computes small symmetric ones slower.
+    squared. Mean and covariance are stored as one matrix M = [P -x; -x^T c]. So a product with M includes those with P
+    and with x, and one product of V above y^T gives all three results. The corner c is multiplied only by zeros.
 
-    The subtraction errs by 1e-16 of the prior. Where the posterior is much smaller, or rows nearly repeat each other, a
-    QR factorisation takes its place (``_rotate``).
+    A prediction reads only the upper triangle of M, so that the two halves differ at most by the rounding of one
+    prediction and the updates after it. Elsewhere general products are used, because BLAS is slower for small symmetric
+    ones. The subtraction has an error of 1e-16 of the prior. If the posterior is much smaller, or rows nearly repeat
+    each other, a QR factorisation is used instead (``_rotate``).
 
-    A nonlinear model is taken with its Jacobian at the mean, F = df/dx and H = dh/dx: the extended filter.
+    A nonlinear model is used with its Jacobian at the mean, F = df/dx and H = dh/dx: the extended filter.
     """
 
     def __init__(self, mean: FloatArray, covariance: FloatArray) -> None:
@@ -132,7 +132,7 @@ class KalmanFilter:
         dcopy(*self._load)
         dsymm(*self._multiply)
         dgemm(*self._propagate)
-        # BLAS does not warn where it overflows.
+        # BLAS does not report an overflow.
         if not ddot(*self._squares) < HUGE:
             self._F_rows[...] = np.eye(self._n)
             raise FilterDiverged(f"prediction is not finite: mean {(-self._predicted_minus_x[:-1]).tolist()}")
@@ -143,7 +143,7 @@ class KalmanFilter:
         self._mean = self._covariance = None
 
     def _check_transition(self, F: FloatArray | FilterModel, Q: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        """F, and of a model f(x); both arrays are as they shall be."""
+        """F, and f(x) for a model, else None. Raises as ``Filter.predict``."""
         name, x = "F", None
         if not isinstance(F, ndarray):
             x, F = F.at(self.mean)
@@ -183,7 +183,7 @@ class KalmanFilter:
                 noise = (noise_root(R).diagonal() ** 2).tolist()
                 np.add(rows.S_rows, R, rows.S_rows)
             for s, r in zip(rows.S_diagonal.tolist(), noise):  # noqa: B905 - of one length; checking that takes longer
-                # The first comparison fails where P is no covariance, each where a number is not finite.
+                # The first comparison fails if P is not a covariance, both fail if a number is not finite.
                 if not r <= s < STRONGEST * r:
                     break
             else:
@@ -196,7 +196,7 @@ class KalmanFilter:
     def _check_measurement(
         self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray
     ) -> tuple[_Rows | None, FloatArray, FloatArray | None]:
-        """Buffers, None for no rows, H, and of a model h(x); all arrays fit each other."""
+        """Buffers (None for no rows), H, and h(x) for a model, else None. Raises ``FilterShapeError``."""
         expected = None
         if not isinstance(H, ndarray):
             expected, H = H.at(self.mean)
@@ -229,12 +229,12 @@ class KalmanFilter:
         return Innovation(residual, nis)
 
     def _rotate(self, rows: _Rows, residual: list[float], R: FloatArray) -> Innovation:
-        """As the least-squares problem that eqs 2.8 to 2.10 solve, without a difference of covariances.
+        """Update by least squares, which solve eqs 2.8 to 2.10 without a difference of covariances.
 
         With P = L L^T and x = x + L u the posterior is the solution of ``u = 0, A u = b`` with A = H L, b = nu, both
-        whitened by R. A QR factorisation of the stacked rows ``[A b; I 0]`` holds all of it: the triangle C with
+        whitened by R. It follows from a QR factorisation of the stacked rows ``[A b; I 0]``: the triangle C with
         C^T C = I + A^T A gives P = (L C^-1) (L C^-1)^T, its last column gives u, and the corner squared is the NIS.
-        A prior far wider than the measurement costs no digits, and many rows cost little.
+        A prior far wider than the measurement loses no digits, and many rows cost little.
         """
         m, n, U, C, stack = len(residual), self._n, self._U, self._C, rows.stack
         U[...] = self._M
@@ -245,8 +245,8 @@ class KalmanFilter:
         dcopy(*rows.load)
         rows.residual[...] = nu
         dtrmm(*rows.rotate)  # [A b]^T, with L = U^T
-        # The measurement, which may be far more exact than the prior, stands first: a reflection that took its rows
-        # into those of the prior would leave their rounding there.
+        # The rows of the measurement, which may be far more exact than the prior, come first. In the other order the
+        # reflections would leave their rounding errors in the rows of the prior.
         if R.ndim == 1:
             least = min(R.tolist())
             if not (least > 0.0 and ddot(R, R) + ddot(rows.V_flat, rows.V_flat) < HUGE):
@@ -272,10 +272,7 @@ class KalmanFilter:
 
 
 def square_root(P: FloatArray) -> FloatArray:
-    """L (n, n) with L L^T = P: lower Cholesky factor, or by eigenvectors.
-
-    Raises ``FilterDiverged`` where P is not semidefinite.
-    """
+    """L (n, n) with L L^T = P: Cholesky factor, or by eigenvectors; ``FilterDiverged`` if P is not semidefinite."""
     L: FloatArray
     L, info = dpotrf(P, 1, 1)
     if info == 0:
@@ -285,7 +282,7 @@ def square_root(P: FloatArray) -> FloatArray:
     values = np.linalg.eigvalsh(P)
     if values[0] < -NEGATIVITY * abs(values[-1]):
         raise FilterDiverged(f"covariance is not positive semidefinite: least eigenvalue {values[0]:.3g}")
-    # In units of the states' own sigmas: a state known exactly keeps its zeros, a small one is not lost beside a large.
+    # In units of the states' own sigmas, so that an exact state keeps its zeros, and rounding does not lose a small one.
     sigma = np.sqrt(np.maximum(P.diagonal(), 0.0))
     per_sigma = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
     values, vectors = np.linalg.eigh(P * per_sigma[:, None] * per_sigma)
@@ -293,7 +290,7 @@ def square_root(P: FloatArray) -> FloatArray:
 
 
 def noise_root(R: FloatArray) -> FloatArray:
-    """Lower Cholesky factor of R (m, m); raises ``FilterDiverged`` where R is not positive definite."""
+    """Lower Cholesky factor of R (m, m); raises ``FilterDiverged`` if R is not positive definite."""
     factor: FloatArray
     factor, info = dpotrf(R, 1, 1)
     if info != 0:

@@ -1,4 +1,4 @@
-"""How good an estimate is: root mean squares, consistency, and the error after the best rigid motion."""
+"""Measures of an estimate: root mean square error, consistency, and the error after the best rigid motion."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from ccatp.core import FloatArray
 
 
 def rms(errors: FloatArray) -> float | None:
-    """Root mean square of what is finite; None of nothing."""
+    """Root mean square of the finite values; None without any."""
     finite = errors[np.isfinite(errors)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else None
 
@@ -21,9 +21,9 @@ def wrapped(angles_rad: FloatArray) -> FloatArray:
 
 
 class Consistency(NamedTuple):
-    """Mean normalised square per degree of freedom: 1 if the covariance is honest.
+    """Mean normalised square per degree of freedom; 1 if the covariance is correct.
 
-    ``low`` and ``high`` bound the 95 % band of independent Gaussian errors.
+    ``low`` and ``high``: 95 % interval for independent Gaussian errors.
     """
 
     mean: float
@@ -59,7 +59,7 @@ class RigidMotion(NamedTuple):
 
     @property
     def angle_rad(self) -> float:
-        """Of a turn in the plane, counter-clockwise."""
+        """Angle of a rotation in the plane, counter-clockwise."""
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
 
     def moved(self, points_m: FloatArray) -> FloatArray:
@@ -82,11 +82,9 @@ class RigidMotion(NamedTuple):
 def best_motion(
     source_m: FloatArray, target_m: FloatArray, *, mirrors: bool = False, weights: FloatArray | None = None
 ) -> RigidMotion:
-    """The motion that minimises sum(w |R a + t - b|^2) (Kabsch 1976, Umeyama 1991), without a scale.
+    """The motion that minimises sum(w |R a + t - b|^2) (Kabsch 1976, Umeyama 1991), without a scale; (n, d) points.
 
-    A, b of shape (n, d).
-
-    With ``mirrors`` R may be a reflection: ranges alone do not distinguish a map and its mirror image.
+    With ``mirrors`` R may be a reflection, because ranges alone do not distinguish a map from its mirror image.
     """
     w = np.ones(len(source_m)) if weights is None else weights
     w = w / w.sum()

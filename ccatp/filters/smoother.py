@@ -1,4 +1,4 @@
-"""Fixed-interval smoother of Rauch, Tung and Striebel: what the whole record says of every step."""
+"""Fixed-interval smoother of Rauch, Tung and Striebel: estimates of every step from the whole record."""
 
 from typing import NamedTuple
 
@@ -9,19 +9,19 @@ from ccatp.core import FloatArray
 from ccatp.filters.base import Filter, FilterDiverged, FilterError, FilterModel, FilterShapeError
 
 BLOCK = 4096
-"""Steps a block of memory holds."""
+"""Number of steps in a block of memory."""
 SINGULAR = 1e-10
-"""Least reciprocal of the growth of F^-1 with which F is taken as invertible."""
+"""Least reciprocal of max|F^-1| max|F| with which F counts as invertible."""
 CUT = 1e-13
-"""Least relative variance of a predicted direction, in units of the states' sigmas, that still counts as known."""
+"""Directions with a smaller relative variance, in units of the states' sigmas, are left out of the pseudo-inverse."""
 
 
 ROUNDING = 1e-9
-"""Part of P', in units of the states' sigmas, up to which a difference from F P F^T + Q is rounding."""
+"""Part of P', in units of the states' sigmas, up to which a difference from F P F^T + Q counts as rounding."""
 
 
 class SmootherEmpty(FilterError):
-    """There is nothing to smooth yet."""
+    """The requested step is not recorded."""
 
 
 class Smoothed(NamedTuple):
@@ -32,26 +32,26 @@ class Smoothed(NamedTuple):
 
 
 class Smoother:
-    """Records a filter's predictions and goes back over them.
+    """Records a filter's predictions and smooths them backward.
 
-    Before each prediction the filtered mean x and covariance P are kept, with F, the predicted mean x' and what the
-    prediction added, Q = P' - F P F^T. Backward from the last filtered state (Rauch, Tung, Striebel 1965),
+    Each prediction is stored with the filtered mean x and covariance P before it, F, the predicted mean x' and the
+    added noise Q = P' - F P F^T. Backward from the last filtered state (Rauch, Tung, Striebel 1965),
 
         G = P F^T P'^-1,   x_s = x + G (x_s' - x'),   P_s = P + G (P_s' - P') G^T
 
-    written so that no difference of covariances is left:
+    in a form without a difference of covariances:
 
         P_s = (I - G F) P (I - G F)^T + G (Q + P_s') G^T
 
-    and, where F is invertible, G = F^-1 (I - Q P'^-1): a state without noise is then carried back by F^-1 itself,
-    however singular P' is. P'^-1 is the pseudo-inverse in units of the states' own sigmas.
+    and, if F is invertible, G = F^-1 (I - Q P'^-1), which maps a state without noise back by F^-1 even if P' is
+    singular. P'^-1 is the pseudo-inverse in units of the states' own sigmas.
 
-    A nonlinear prediction is recorded with ``Filter.transition``; Q is then what that line does not explain. A change
-    of the state that no prediction made (a reset, another frame of reference) is recorded as one, with its F and the
-    variance it added; otherwise the way back passes over it as if it were information.
+    A nonlinear prediction is recorded with ``Filter.transition``; Q then includes the error of this linearisation. Any
+    other change of the state (a reset, another frame of reference) has to be recorded as a prediction, with its F and
+    the variance that it added. Otherwise the smoother treats it as information.
 
-    Memory: 8 (3 n^2 + 2 n) bytes a step, 3.6 kB at n = 12; half of that with ``dtype`` np.float32, which leaves the
-    covariances about 6 digits. ``smooth`` adds 8 (n^2 + n) bytes for each step asked for.
+    Memory: 8 (3 n^2 + 2 n) bytes per step, 3.6 kB at n = 12; half of that with ``dtype`` np.float32, which leaves about
+    6 digits of the covariances. ``smooth`` adds 8 (n^2 + n) bytes per requested step.
     """
 
     def __init__(self, n: int, dtype: type[np.float64] | type[np.float32] = np.float64) -> None:
@@ -67,23 +67,20 @@ class Smoother:
         return self._count
 
     def predict(self, filter_: Filter, F: FloatArray | FilterModel, Q: FloatArray) -> None:
-        """Let the filter predict by F and Q, and keep the step; see ``Filter.predict`` for what it refuses."""
+        """Predict with the filter by F and Q, and record the step. Raises as ``Filter.predict``."""
         mean, covariance = filter_.mean, filter_.covariance
         filter_.predict(F, Q)
         A = filter_.transition
         excess = filter_.covariance - A.dot(covariance).dot(A.T) - Q
         sigma = np.sqrt(np.maximum(filter_.covariance.diagonal(), 0.0))
-        # Rounding is left out, so that a state without noise stays one.
+        # Rounding is ignored, so that a state without noise keeps Q = 0.
         is_rounding = bool((np.abs(excess) <= ROUNDING * np.outer(sigma, sigma)).all())
         self.record(mean, covariance, A, filter_.mean, Q if is_rounding else Q + excess)
 
     def record(
         self, mean: FloatArray, covariance: FloatArray, F: FloatArray, predicted: FloatArray, Q: FloatArray
     ) -> None:
-        """Keep one prediction: x (n,), P and F (n, n) before it, x' (n,) after it, Q (n, n).
-
-        Raises ``FilterShapeError``.
-        """
+        """Record a prediction: x (n,), P and F (n, n) before, x' (n,) after, Q (n, n); ``FilterShapeError``."""
         n = self._n
         given = (("mean", mean), ("covariance", covariance), ("F", F), ("predicted", predicted), ("Q", Q))
         for name, array in given:
@@ -97,12 +94,9 @@ class Smoother:
         self._count += 1
 
     def smooth(self, filter_: Filter, first: int = 0) -> Smoothed:
-        """States at the recorded steps from ``first`` on, oldest first, and last the filter's own.
+        """The len(self) - first + 1 states from step ``first`` on, oldest first; the last is the filter's own.
 
-        Len(self) - first + 1.
-
-        Raises ``SmootherEmpty``: nothing is recorded, or less than ``first``; ``FilterDiverged``: a state is not
-        finite.
+        Raises ``SmootherEmpty`` if step ``first`` is not recorded, ``FilterDiverged`` if a state is not finite.
         """
         if not 0 <= first < self._count:
             raise SmootherEmpty(f"step {first} of {self._count} recorded: record predictions before smoothing")

@@ -9,28 +9,28 @@ from ccatp.filters.base import HUGE, FilterDiverged, FilterModel, FilterShapeErr
 from ccatp.filters.kalman import KalmanFilter, noise_root, square_root
 
 ALPHA = 1.0
-"""Spread of the points. 1 keeps every weight at or above zero: small values put a mean of weight -1/alpha^2 against the
-others, which costs as many digits and may leave a matrix that is no covariance."""
+"""Spread of the points. With 1 all weights are >= 0. A small value gives the mean a weight near -1/alpha^2, which loses
+as many digits and may give a matrix that is not a covariance."""
 BETA = 2.0
-"""Weight of the fourth moment: 2 is best for a Gaussian."""
+"""Weight of the fourth moment; 2 is the best value for a Gaussian."""
 KURTOSIS = 3.0
 """n + kappa of a Gaussian in one dimension: kappa = max(3 - n, 0)."""
 
 
 class UnscentedKalmanFilter(KalmanFilter):
-    """The Kalman filter with the scaled unscented transform in place of Jacobians (Julier 2002).
+    """The Kalman filter with the scaled unscented transform instead of Jacobians (Julier 2002).
 
     With lambda = alpha^2 (n + kappa) - n and L L^T = P the 2 n + 1 points are x and x +- sqrt(n + lambda) L_i, with the
     weights W_0 = lambda / (n + lambda) in the mean, W_0 + 1 - alpha^2 + beta in the covariance, and
-    1 / (2 (n + lambda)) for the others in both. Of the images Y of the points
+    1 / (2 (n + lambda)) for the others in both. With the images Y of the points:
 
     predict:  x = sum W_i Y_i,  P = sum W_i (Y_i - x)(Y_i - x)^T + Q
     update:   nu = z - sum W_i Y_i,  S = sum W_i dY_i dY_i^T + R,  C = sum W_i dX_i dY_i^T,
               W = C S^-1,  x = x + W nu,  P = P - W S W^T
 
-    The update draws its points again. A matrix in place of a model is taken as the linear filter takes it: the
-    transform is exact there. ``transition`` of a nonlinear prediction is C^T P^-1 of its points, the statistical
-    linearisation; along a direction of no variance it is zero.
+    The update draws new points. With a matrix instead of a model, the linear filter is used, because the transform is
+    exact there. ``transition`` of a nonlinear prediction is C^T P^-1 of its points, the statistical linearisation; it
+    is zero along a direction without variance.
     """
 
     def __init__(self, mean: FloatArray, covariance: FloatArray) -> None:
@@ -48,7 +48,7 @@ class UnscentedKalmanFilter(KalmanFilter):
 
     @property
     def transition(self) -> FloatArray:
-        """F of the last prediction, or the regression of its points, shape (n, n); see ``Filter.transition``."""
+        """F, or the regression of the points, of the last prediction, shape (n, n); see ``Filter.transition``."""
         if self._predicted is not None:
             cross, L = self._predicted
             # A with A P = cross^T by least squares, because P = L L^T may be singular.
@@ -100,7 +100,7 @@ class UnscentedKalmanFilter(KalmanFilter):
         if not np.vdot(images, images) + ddot(z, z) + np.vdot(R, R) < HUGE:
             raise FilterDiverged(f"update is not finite: readings {z.tolist()}, or their expectation or noise")
         if R.ndim == 2:
-            noise_root(R)  # refuses what is no covariance
+            noise_root(R)  # raises if R is not a covariance
         elif not min(R.tolist()) > 0.0:
             raise FilterDiverged(f"R is not positive definite: least variance {min(R.tolist()):.3g}")
         expected = self._weights.dot(images)
