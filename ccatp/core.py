@@ -1,4 +1,4 @@
-"""Value types that every package shares: samples, poses, fixes, verdicts; angles; robot time without its jumps."""
+"""Value types shared by all packages (samples, poses, fixes, verdicts), angles, kinematics, steady robot time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 
 # Ranges that a decoder of samples checks.
-MAX_TIME_S = 1e9  # some thirty years
+MAX_TIME_S = 1e9  # about thirty years
 GRAVITY_M_S2 = 9.771  # at latitude -22.99 deg, 5,612 m
-MAX_RATE_RAD_S = 1e4  # wheels and body; beyond every machine, so that squares stay finite
+MAX_RATE_RAD_S = 1e4  # of wheels and body; no machine reaches it, and squares stay finite
 MAX_ACCELERATION_M_S2 = 1e4
 Time = Annotated[float, Meta(ge=0.0, le=MAX_TIME_S)]
 Rate = Annotated[float, Meta(ge=-MAX_RATE_RAD_S, le=MAX_RATE_RAD_S)]
@@ -124,14 +124,14 @@ class EventCode(IntEnum):
 
 
 class Severity(IntEnum):
-    """How grave a finding is; of several the gravest counts."""
+    """Severity of a finding; of several findings the highest counts."""
 
     NONE = 0
-    INFORM = 1  # is reported, and nothing else
-    SLOW = 2  # go on at reduced speed
-    PAUSE = 3  # hold the wheels, go on as soon as it is over
-    HOLD = 4  # hold the wheels, go on when it is over and a fix was had
-    RETURN = 5  # home, at reduced speed
+    INFORM = 1  # report only
+    SLOW = 2  # continue at reduced speed
+    PAUSE = 3  # hold the wheels until the cause is gone
+    HOLD = 4  # hold the wheels until the cause is gone, then take a fix
+    RETURN = 5  # drive home, at reduced speed
     FAULT = 6  # hold the wheels until an operator resumes
 
 
@@ -145,23 +145,23 @@ class Corner(StrEnum):
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """What the danger loop says about one sensor frame."""
+    """The danger loop's verdict on one sensors frame."""
 
     seq: int
     t_s: float
     code: EventCode
     cause: str
-    signal: str  # what gave ``cause`` ("front_left", "estimate", "emergency:fire"), or empty
+    signal: str  # source of ``cause`` ("front_left", "estimate", "emergency:fire"), or empty
     value: float  # of the signal, in the unit of ``limit``
     limit: float
     forward: bool
     reverse: bool
     turn: bool
     off: tuple[bool, bool, bool, bool] = (False, False, False, False)  # the edge sensors of a declared edge
-    severity: Severity = Severity.NONE  # of what gave cause; NONE for an edge, whose reaction is in code and permits
+    severity: Severity = Severity.NONE  # of the cause; NONE for an edge, which code and permits describe
     full_fans: bool = False
     raised: int = 0  # number of emergencies raised so far while one is latched
-    is_shaking: bool = False  # an earthquake is latched, whatever else gave code and cause
+    is_shaking: bool = False  # an earthquake is latched, even if code and cause are of another rule
 
 
 class Twist(msgspec.Struct, frozen=True):
@@ -172,7 +172,7 @@ class Twist(msgspec.Struct, frozen=True):
 
 
 class Predicted(msgspec.Struct, frozen=True):
-    """Where the robot will be: a pose in a plane, (x_m, y_m, heading_rad), and the speeds there."""
+    """A predicted state: a pose in a plane, (x_m, y_m, heading_rad), and the speeds."""
 
     pose: Vector3
     v_m_s: float
@@ -180,7 +180,7 @@ class Predicted(msgspec.Struct, frozen=True):
 
 
 class StopKind(StrEnum):
-    """What a stop on the path is for."""
+    """Purpose of a stop."""
 
     MEASURE = "measure"
     CALIBRATE = "calibrate"
@@ -190,9 +190,9 @@ class StopKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """One stop of a path: where the robot's origin shall stand, deck frame.
+    """One stop of a route: target of the robot's origin, deck frame.
 
-    ``reverse``: the leg that ends here is driven backwards. ``heading_rad``: deck heading to turn to after arriving.
+    ``reverse``: the leg to this stop is driven in reverse. ``heading_rad``: deck heading to turn to after arrival.
     """
 
     x_m: float
@@ -204,7 +204,7 @@ class Stop:
 
     @property
     def is_measured(self) -> bool:
-        """The robot stands there for a measurement."""
+        """The robot measures there."""
         return self.kind in (StopKind.MEASURE, StopKind.CALIBRATE)
 
 
@@ -252,34 +252,34 @@ def twist_of(right_rad_s: float, left_rad_s: float, wheel_radius_m: float, wheel
     )
 
 
-_LEAST_SHARE = 0.3  # of the limit: a turn alone is no slide
+_LEAST_SHARE = 0.3  # least part of the slip limit, because a difference in turning alone is no slide
 
 
 class SlideRule:
-    """Loss of grip: the body goes downhill faster than its wheels, and less so where it turns with them neither.
+    """Detects loss of grip: the body moves downhill faster than its wheels.
 
-    What it gains on its wheels in speed, and in angle, is summed with a memory of 60 ms. Limits ``slip_m_s`` and
-    ``turn_rad``.
+    The differences between body and wheels in speed and in angle are summed with a memory of 60 ms, and compared with
+    the limits ``slip_m_s`` and ``turn_rad``. The larger the difference in angle, the smaller the slip that is allowed.
     """
 
     MEMORY_S = 0.06
-    LEAST_SLOPE = 0.15  # of gravity along the surface: with less it does not slide
-    LARGEST_M_S2 = 10.0  # gravity gives no more
-    WHEEL_JUMP_M_S = 0.03  # of the wheels' speed in 10 ms: no wheel that carries the robot does that
-    BIAS_SAMPLES = 50  # of the accelerometer at rest, whose mean is its bias
+    LEAST_SLOPE = 0.15  # least component of the unit gravity along the surface with which the robot can slide
+    LARGEST_M_S2 = 10.0  # gravity cannot cause a larger acceleration
+    WHEEL_JUMP_M_S = 0.03  # larger than any change in 10 ms of the speed of a wheel with load
+    BIAS_SAMPLES = 50  # accelerometer samples at rest whose mean is its bias
 
     def __init__(self, slip_m_s: float, turn_rad: float) -> None:
         self.slip_m_s, self._turn_rad = slip_m_s, turn_rad
         self._ahead_m_s = self._left_m_s = self._turned_rad = 0.0
 
     def reset(self) -> None:
-        """Nothing is known of the last 60 ms."""
+        """Drop the sums of the last 60 ms."""
         self._ahead_m_s = self._left_m_s = self._turned_rad = 0.0
 
     def step(self, dt_s: float, ahead_m_s: float, left_m_s: float, turned_rad: float, downhill: Vector2) -> float:
-        """Take what was gained within ``dt_s``; how fast it slides downhill, m/s; 0: it does not.
+        """Take the differences, body minus wheels, within ``dt_s``; returns the slide downhill, m/s, 0 without one.
 
-        ``downhill``: unit vector, robot frame; zeros where there is no slope.
+        ``downhill``: unit vector, robot frame; zeros without a slope.
         """
         keep = self.MEMORY_S / (self.MEMORY_S + dt_s)
         self._ahead_m_s = keep * (self._ahead_m_s + ahead_m_s)
@@ -291,7 +291,7 @@ class SlideRule:
         return downhill_m_s if slides else 0.0
 
 
-# By the signal; whatever is stale or missing has an age. A signal that stands for several quantities has none.
+# Unit of the value, by the signal. A signal with values of several kinds has none; a stale or missing one has an age.
 _UNITS = dict.fromkeys(("estimate", "sensors", "enc", "frames", "clock", "latency", "radio"), "s") | {
     "encoders": "m/s",
     "imu_wz": "rad/s",
@@ -300,7 +300,7 @@ _UNITS = dict.fromkeys(("estimate", "sensors", "enc", "frames", "clock", "latenc
 
 
 def danger_text(cause: str, signal: str, value: float, limit: float) -> str:
-    """As ``estimate stale: 0.31 s (limit 0.15 s)``. A limit of 0 is none, a signal that ``cause`` names is left out."""
+    """Like ``estimate stale: 0.31 s (limit 0.15 s)``; without a limit of 0 or a signal that ``cause`` names."""
     named = signal.replace("_", " ")
     where = "" if not named or named in cause or signal.startswith("emergency") else f" ({named})"
     if not limit:
@@ -308,7 +308,7 @@ def danger_text(cause: str, signal: str, value: float, limit: float) -> str:
     is_age = cause.startswith("no ") or "stale" in cause
     unit = "s" if is_age else _UNITS.get(signal, "")
     shown, bound = (f"{number:.4g} {unit}".rstrip() for number in (value, limit))
-    # Of what was never there the age is put at the limit.
+    # A signal that was never received has its age set to the limit.
     return f"{cause}{where}: " + (f"limit {bound}" if shown == bound else f"{shown} (limit {bound})")
 
 
@@ -316,18 +316,18 @@ _Sample = TypeVar("_Sample", ImuSample, WheelSample, EdgeSample, GravitySample)
 
 
 class ClockJump(NamedTuple):
-    """The robot's clock jumped before frame ``seq``, by so much against what was expected; < 0 backward."""
+    """A jump of the robot's clock before frame ``seq``, by ``by_s`` against the expected time; < 0 backward."""
 
     seq: int
     by_s: float
 
 
 class SteadyTime:
-    """Gives each frame a time that never jumps; ``jump`` is the newest jump, ``None`` before the first.
+    """Gives each frame a time that never jumps. ``jump``: the newest jump, ``None`` before the first.
 
-    From frame to frame the robot's clock has to go on by the frames' period, times the frames that were lost in
-    between; further off than ``limit_s``, or backward, it has jumped, and counting goes on by the period. A real gap
-    without frames whose numbers go on looks the same, and is left out likewise.
+    From frame to frame the robot's clock has to advance by the period of the frames, times the frames lost in between.
+    If it differs by more than ``limit_s``, or goes backward, it has jumped, and the steady time advances by the period.
+    A pause of the frames with consecutive numbers looks like a jump, and is treated the same way.
     """
 
     def __init__(self, limit_s: float) -> None:
@@ -337,7 +337,7 @@ class SteadyTime:
         self.jump: ClockJump | None = None
 
     def at(self, seq: int, t_s: float) -> float:
-        """The steady time of frame ``seq``, which is newer than all before, of robot time ``t_s``, s."""
+        """The steady time of the newest frame ``seq`` at robot time ``t_s``, s."""
         if self._seq < 0:
             self._seq, self._t_s = seq, t_s
             return t_s
@@ -353,12 +353,12 @@ class SteadyTime:
         return t_s + self.offset_s
 
     def of(self, seq: int, t_s: float) -> float:
-        """The steady time of an older frame ``seq`` of robot time ``t_s``, s; at most one jump lies in between."""
+        """The steady time of an older frame ``seq`` at robot time ``t_s``, s; at most one jump lies in between."""
         is_before = self.jump is not None and seq < self.jump.seq
         return t_s + (self._before_s if is_before else self.offset_s)
 
     def of_samples(self, samples: Sequence[_Sample], t_s: float) -> list[_Sample]:
-        """Samples of the newest frame at steady times, each in the time base in which it is near to the frame."""
+        """Samples of the newest frame at steady times; each uses the time base that is nearer to the frame."""
         now_s, before_s, limit_s = self.offset_s, self._before_s, self._limit_s
         found = []
         for sample in samples:
@@ -369,15 +369,10 @@ class SteadyTime:
 
 
 class MissionClock:
-    """Numbers and times of the frames.
+    """Numbers and times of the frames of a mission.
 
-    Args:
-        jump_s: the robot's clock has jumped if a frame is further off.
-
-    Attributes:
-        seq: the newest frame.
-        t_s: its time, without jumps.
-        before_s: robot time of the mission before the first frame that is served here.
+    ``jump_s``: limit of ``SteadyTime``. ``seq``: the newest frame; ``t_s``: its time without jumps; ``before_s``: time
+    of the mission before the first frame served here.
     """
 
     def __init__(self, jump_s: float) -> None:
@@ -388,7 +383,7 @@ class MissionClock:
 
     @property
     def has_begun(self) -> bool:
-        """A frame was served, in this boot of the robot."""
+        """Whether a frame was served since the robot's last boot."""
         return self._first_s is not None
 
     @property
@@ -398,12 +393,12 @@ class MissionClock:
 
     @property
     def offset_s(self) -> float:
-        """``t_s`` less the robot's time."""
+        """``t_s`` minus the robot's time."""
         return self._steady.offset_s
 
     def take(self, seq: int, t_s: float, period_s: float) -> tuple[float, float]:
-        """A frame is served now: its time, and the time since the last one (``period_s`` without one), s."""
-        # Durations are counted by a time that does not jump; everything else by the robot's own.
+        """Take a served frame; returns its time, and the time since the last one (``period_s`` for the first), s."""
+        # Durations use a time that does not jump; everything else uses the robot's own time.
         before_s, steady_s = self.t_s, self.t_s
         if seq > self.seq:
             self.seq, steady_s = seq, self._steady.at(seq, t_s)
@@ -414,6 +409,6 @@ class MissionClock:
         return steady_s, steady_s - before_s
 
     def reset(self) -> None:
-        """The robot's frames and clock restarted."""
+        """Begin again, because the robot's frame numbers and clock have restarted."""
         self.before_s, self._first_s, self.seq = self.elapsed_s, None, -1
         self._steady = SteadyTime(self._jump_s)

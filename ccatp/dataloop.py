@@ -1,7 +1,7 @@
-"""The simulated robots behind the robot link, what is logged of them, and the true state beside the link.
+"""The servers of the simulated robots, their log, and the publication of the true state.
 
-The sockets of the robot link carry what a real robot would send and nothing else. The true state leaves by ZeroMQ: a
-REP socket with the requests of ``GroundTruthPublisher`` and of the robot, and a PUB socket with rows.
+The robot link carries only what a real robot would send. The true state is sent by ZeroMQ: a REP socket for the
+requests of ``GroundTruthPublisher`` and of the robot, and a PUB socket with rows.
 
 Known limitations: the battery stays full, and nothing fails without a fault plan (``ccatp.sim.fault_injector``).
 """
@@ -36,7 +36,7 @@ from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile, SurveyTrut
 from ccatp.sim.hardware import SimulatedHardware
 from ccatp.sim.robot import Robot
 
-_SAME_STEP = 1e-6  # times of steps and frames are equal to within rounding
+_SAME_STEP = 1e-6  # tolerance for the rounding of times of steps and frames
 
 
 def _hardware_class(cfg: Config) -> type[SimulatedHardware]:
@@ -48,9 +48,9 @@ def _hardware_class(cfg: Config) -> type[SimulatedHardware]:
 
 
 class MotorRobot(OnboardRobot, SurveyTruth):
-    """A simulated survey robot with motors under the on-board core, just booted; simulated time."""
+    """A simulated survey robot whose motors are driven by the on-board core, just booted; simulated time."""
 
-    injector = None  # faults are those of the other robot
+    injector = None  # only ``Robot`` has faults
 
     def __init__(self, cfg: Config, onboard: OnboardConfig, start: DeckPose | None = None) -> None:
         servo, sim = onboard.servo, cfg.sim.robot
@@ -60,7 +60,7 @@ class MotorRobot(OnboardRobot, SurveyTruth):
         )  # fmt: skip
         self.world = hardware.world
         super().__init__(onboard, hardware, round(cfg.world.commands_delay_s * sim.frame_hz))
-        # The newest line last; the first is delivered once the deque is full.
+        # The newest line is last; the first one is delivered once the deque is full.
         self._lines: deque[tuple[int, bytes]] = deque(maxlen=round(cfg.world.sensors_delay_s * sim.frame_hz) + 1)
         self._steps = 0
         self._close_frame(self.t_s)
@@ -75,7 +75,7 @@ class MotorRobot(OnboardRobot, SurveyTruth):
 
     @property
     def delivered(self) -> Sensors | None:
-        """The frame that reached the clients at this instant, ``None`` while none has."""
+        """The frame that was delivered to the clients now, or ``None``."""
         message = decode_from_robot(self.delivered_line) if self.delivered_line else None
         return message if isinstance(message, Sensors) else None
 
@@ -90,11 +90,7 @@ AnyRobot = Robot | MotorRobot | BeaconRobot
 
 
 class DataLoop(TcpRobotServer):
-    """The server of one simulated robot.
-
-    Each of the ``faults`` is logged when it begins and ends, and with what it did; a fall of the robot is logged when
-    it falls.
-    """
+    """The server of one simulated robot. It logs the begin, end and effect of ``faults``, and a fall of the robot."""
 
     robot: AnyRobot
 
@@ -114,7 +110,7 @@ class DataLoop(TcpRobotServer):
 
     async def close(self) -> None:
         if self._listener is not None:
-            self._log_faults()  # what happened since the last frame
+            self._log_faults()  # changes since the last frame
             for faults in self._faults:
                 for injected in faults.injected:
                     self._log_fault("injected", injected)
@@ -156,7 +152,7 @@ def motor_robot(cfg: Config, start: DeckPose | None = None) -> MotorRobot:
 
 
 def survey_robot(cfg: Config, faults: FaultPlan | None = None, start: DeckPose | None = None) -> Robot:
-    """The survey robot of a configuration, just booted; at base where no ``start`` is given."""
+    """The survey robot of a configuration, just booted, at ``start`` or at base."""
     return Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), faults, start)
 
 
@@ -177,10 +173,10 @@ async def serve(
     body_file: Path | None = None,
     is_resuming: bool = False,
 ) -> bool:
-    """Run the simulated robot of a configuration until ``stop`` is set; whether it fell.
+    """Run the simulated robot of a configuration until ``stop`` is set; returns whether it fell.
 
-    ``faults`` of a survey may be those of the robot and of its link; for the link a proxy listens in the robot's place.
-    ``body_file`` keeps the true pose of the survey robot between runs. ``zmq.ZMQError``: an endpoint cannot be had.
+    ``faults`` (survey robot only) may include faults of the link, for which a proxy listens instead of the robot.
+    ``body_file`` keeps the true pose between runs. Raises ``zmq.ZMQError`` if an endpoint cannot be bound.
     """
     robot: AnyRobot
     at_work: list[Injector | LinkFaults] = []

@@ -1,10 +1,10 @@
-"""The errors that end a command: each is one line for the reader and an exit status for scripts."""
+"""The errors that end a command: each has one line of text and an exit status for scripts."""
 
 import re
 from collections.abc import Sequence
 from enum import IntEnum
 
-# What a terminal obeys instead of showing it, and halves of characters, which no encoding takes.
+# Control characters, and surrogates, which cannot be encoded.
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 LONGEST_LINE = 300  # characters of one message
 
@@ -22,19 +22,19 @@ class ExitStatus(IntEnum):
 
 
 def printable(text: str) -> str:
-    """A text with backslash escapes in place of control characters other than tabs and line feeds."""
+    """A text with backslash escapes instead of control characters, except tabs and line feeds."""
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def one_line(text: str, longest: int = LONGEST_LINE) -> str:
-    """A text as one printable line; a long one without its middle, since a message ends with what to do."""
+    """A text as one printable line. A long one loses its middle, because a message ends with the advice."""
     line = printable(" ".join(text.split()))
     begin, end = 2 * longest // 3, longest // 3 - 3
     return line if len(line) <= longest else f"{line[:begin]}...{line[-end:]}"
 
 
 class CcatpError(Exception):
-    """An expected end with an ``exit_status``: ``str(error)`` is one line that says what is wrong and what to do."""
+    """Base of the expected errors: ``str(error)`` is one line that says what is wrong and what to do."""
 
     exit_status: int = ExitStatus.HELD
 
@@ -43,13 +43,13 @@ class CcatpError(Exception):
 
 
 class UsageError(CcatpError):
-    """What a command was given cannot be used."""
+    """The arguments of a command cannot be used."""
 
     exit_status = ExitStatus.USAGE
 
 
 class ConfigError(UsageError):
-    """An unusable configuration; ``problems``: one line each, ``file:line: key: what is wrong; what to do``."""
+    """An invalid configuration; ``problems``: one line each, ``file:line: key: what is wrong; what to do``."""
 
     def __init__(self, *problems: str, shows_all: bool = False) -> None:
         self.problems: Sequence[str] = [one_line(problem) for problem in problems]
@@ -65,6 +65,6 @@ class RefusedError(CcatpError):
 
 
 class DaemonUnreachableError(CcatpError):
-    """A peer that does not answer."""
+    """A peer does not answer."""
 
     exit_status = ExitStatus.UNREACHABLE

@@ -1,7 +1,7 @@
-"""Client of the MultiLine server: lengths over TCP, multilaterated to the position of the puck.
+"""Client of the MultiLine server: reads lengths over TCP and computes the position of the puck from them.
 
-A connection that has failed a request in any way, or that has sent something unasked, is closed: the next request
-makes another, so that a late reply can never answer it. A fix is a function of the replies and the arguments alone.
+After a failed request or unexpected data the connection is closed, and the next request opens a new one. So a late
+reply can never answer another request. A fix depends only on the replies and the arguments.
 """
 
 import asyncio
@@ -22,13 +22,13 @@ from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 
 
 class EtalonError(CcatpError):
-    """Base: no fix. The message says what, where and what to do, in one line."""
+    """Base: there is no fix. The message is one line with problem, server and advice."""
 
     exit_status = ExitStatus.UNREACHABLE
 
 
 class EtalonUnreachable(EtalonError):
-    """No connection, or it was lost."""
+    """There is no connection, or it was lost."""
 
 
 class EtalonTimeout(EtalonError):
@@ -36,26 +36,23 @@ class EtalonTimeout(EtalonError):
 
 
 class EtalonBadReply(EtalonError):
-    """A reply outside the grammar, too long, or to another request."""
+    """A reply has a wrong format, is too long, or is for another request."""
 
 
 class EtalonServerError(EtalonError):
-    """The server reports an error: its number, or that it refused the request, in words."""
+    """The server reports an error number, or refuses the request."""
 
 
 class TooFewChannels(EtalonError):
-    """Fewer than four valid lengths."""
+    """There are fewer than four valid lengths."""
 
 
 class StaleLengths(EtalonError):
-    """The server repeats the lengths of a place that the robot has left."""
+    """The server repeats the lengths of the robot's last place."""
 
 
 class BadSolution(EtalonError):
-    """The lengths give no position that can be trusted; ``__cause__`` is the error of the multilateration.
-
-    ``lengths_m`` are the lengths by channel.
-    """
+    """The lengths give no valid position. ``__cause__``: error of the multilateration; ``lengths_m``: by channel."""
 
     def __init__(self, message: str, lengths_m: dict[int, float]) -> None:
         super().__init__(message)
@@ -63,7 +60,7 @@ class BadSolution(EtalonError):
 
 
 _NEEDED_CHANNELS = 4
-_MOVED_M = 0.005  # further apart than this two places have different lengths
+_MOVED_M = 0.005  # places further apart than this have different lengths
 
 _ReplyT = TypeVar("_ReplyT", Connected, LaserReady, Environment, ChannelData)
 _T = TypeVar("_T")
@@ -78,12 +75,11 @@ class Readiness(NamedTuple):
 
 
 class EtalonClient:
-    """Measures where the puck is, with k >= 4 channels, each once, and their collimators in the world frame, (k, 3).
+    """Measures the position of the puck with k >= 4 different channels; their collimators: world frame, (k, 3), m.
 
-    ``on_retry`` is called with each error after which it is tried again, and how many tries are left then.
-
-    ``ValueError``: channels and collimators do not fit, or are too few. ``counts``: connects, requests, retries,
-    drained (connections closed for unasked or left-over bytes).
+    ``on_retry`` is called before each retry with the error and the number of retries left. ``counts``: connects,
+    requests, retries, drained (connections closed because of unexpected bytes). Raises ``ValueError`` if channels and
+    collimators do not fit each other or are too few.
     """
 
     def __init__(
@@ -103,25 +99,25 @@ class EtalonClient:
         self._request = MultilineRequest(Command.LATEST_LENGTH_VALID, self._channels)
         self._connection: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._turn = asyncio.Lock()
-        self._last: tuple[dict[int, float], Vector3] | None = None  # lengths of the last fix, and where it was expected
+        self._last: tuple[dict[int, float], Vector3] | None = None  # lengths and expected position of the last fix
 
     async def connect(self) -> None:
-        """Connect, unless connected; ``EtalonUnreachable``: not within the configured number of tries."""
+        """Connect, unless connected. Raises ``EtalonUnreachable`` after the configured retries."""
         async with self._turn:
             await self._retry(self._usable_connection)
 
     async def close(self) -> None:
-        """Close the connection. A request under way ends first."""
+        """Close the connection after the current request."""
         async with self._turn:
             self._drop()
 
     async def isready(self) -> Readiness:
-        """Ask for lasers connected, lasers warm, and the air; errors as of ``measure``."""
+        """Read whether the lasers are connected and warm, and the environment data. Raises as ``measure``."""
         async with self._turn:
             return await self._retry(self._ask_readiness)
 
     async def is_laser_ready(self) -> bool:
-        """Ask whether the lasers are warm: before that lengths mean nothing; errors as of ``measure``."""
+        """Read whether the lasers are warm; before that the lengths are not valid. Raises as ``measure``."""
         async with self._turn:
             reply = await self._retry(lambda: self._ask(MultilineRequest(Command.LASER_READY), LaserReady))
         return reply.value
@@ -129,16 +125,16 @@ class EtalonClient:
     async def measure(self, t_s: float, expected_position_m: Vector3) -> Fix:
         """Measure the puck of a robot that stands still; ``t_s`` becomes the time of the fix.
 
-        The solution starts at ``expected_position_m``, world frame, which also decides between two mirror images where
-        all collimators lie in one plane. ``EtalonError``: after the configured retries, the error of the last one.
+        The solution starts at ``expected_position_m``, world frame. If all collimators lie in one plane, this also
+        selects one of the two mirror images. Raises the ``EtalonError`` of the last retry.
         """
         async with self._turn:
             return await self._retry(lambda: self._measure_once(t_s, expected_position_m))
 
     async def _retry(self, attempt: Callable[[], Awaitable[_T]]) -> _T:
-        """Try up to ``retries`` times more. What needs a new measurement waits for one, what needs a server for it.
+        """Call ``attempt`` with up to ``retries`` retries, after a wait for the server or for a new measurement.
 
-        A server that is not there, because it is restarted, is waited for: that costs time and no try.
+        For an unreachable server, which may be restarting, it retries for at least ``reconnect_for_s``.
         """
         left = self._cfg.retries
         clock = asyncio.get_running_loop().time
@@ -160,9 +156,9 @@ class EtalonClient:
                     await asyncio.sleep(self._cfg.measuring_time_s)
 
     async def _usable_connection(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-        """The connection, or a new one where there is none on which nothing has come since the last reply."""
+        """The connection, or a new one if there is none or if it has received bytes since the last reply."""
         if self._connection is not None:
-            # Two turns of the event loop: what lies in the socket by now is delivered, and seen here.
+            # Two cycles of the event loop deliver the bytes that the socket has received.
             await asyncio.sleep(0)
             await asyncio.sleep(0)
             if await _next_byte(self._connection[0]) is None:
@@ -186,7 +182,7 @@ class EtalonClient:
             self._connection = None
 
     async def _ask(self, request: MultilineRequest, expected: type[_ReplyT]) -> _ReplyT:
-        """One request, one reply of the expected kind; whatever else happens, the connection is gone."""
+        """Send one request and return its reply of the expected type. After any failure the connection is closed."""
         reader, writer = await self._usable_connection()
         self.counts["requests"] += 1
         is_answered = False
@@ -246,7 +242,7 @@ class EtalonClient:
         return fix
 
     def _refuse_old(self, lengths_m: dict[int, float], expected_m: Vector3) -> None:
-        """Lengths have noise: where all are the same to the last digit and the robot has moved, none was measured."""
+        """Refuse lengths that equal the last ones to the last digit although the robot moved: they are not measured."""
         if self._last is None:
             return
         before_m, there_m = self._last
@@ -259,7 +255,7 @@ class EtalonClient:
 
 
 async def _next_byte(reader: asyncio.StreamReader) -> bytes | None:
-    """A byte that has come already, empty where the connection has ended; ``None`` where nothing has happened."""
+    """A byte received already, empty if the connection has ended, ``None`` otherwise."""
     try:
         async with asyncio.timeout(0.0):
             return await reader.read(1)

@@ -1,4 +1,4 @@
-"""The localizers, and which one a configuration asks for."""
+"""Builds the localizer of a configuration."""
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, PanelPose
@@ -8,7 +8,7 @@ from ccatp.estimation.thesis_localizer import FourStateLocalizer
 from ccatp.mirror.mirror import Mirror
 
 FOUR_STATE = ("kf",)
-"""Filters for linear models, which get the thesis's four states; all others get the full state."""
+"""Filters for linear models, which use the thesis's four states; all others use the full state."""
 
 
 Localizer = FourStateLocalizer | FullStateLocalizer
@@ -21,9 +21,9 @@ def build_localizer(
     wrap: FilterWrap = unwrapped,
     start: PanelPose | None = None,
 ) -> Localizer:
-    """The localizer for ``run.filter``, the robot at base or at ``start``; ``wrap`` is put around the filter.
+    """The localizer for ``run.filter`` with the robot at base or at ``start``; ``wrap`` wraps the filter.
 
-    ``start`` is as well known as ``localizer.start_..._sigma`` says.
+    The standard deviations of the start are ``localizer.start_..._sigma``.
     """
     kind: type[Localizer] = FourStateLocalizer if cfg.run.filter in FOUR_STATE else FullStateLocalizer
     return kind(cfg, mirror, start or mirror.base_panel_pose, wrap)
@@ -36,7 +36,7 @@ def build_with_uncertainty(
     sigmas: tuple[float, float],
     wrap: FilterWrap = unwrapped,
 ) -> Localizer:
-    """The localizer for ``run.filter`` at a deck ``pose`` seen last, with sigmas of place (m) and heading (rad)."""
+    """The localizer for ``run.filter`` at a deck ``pose``; ``sigmas``: of position (m) and heading (rad)."""
     start = {"start_position_sigma_m": sigmas[0], "start_heading_sigma_rad": sigmas[1]}
     uncertain = cfg.model_copy(update={"localizer": cfg.localizer.model_copy(update=start)})
     return build_localizer(uncertain, mirror, wrap, mirror.panel_pose(mirror.nearest_panel(pose.x_m, pose.y_m), pose))
