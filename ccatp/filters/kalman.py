@@ -282,7 +282,7 @@ def square_root(P: FloatArray) -> FloatArray:
     values = np.linalg.eigvalsh(P)
     if values[0] < -NEGATIVITY * abs(values[-1]):
         raise FilterDiverged(f"covariance is not positive semidefinite: least eigenvalue {values[0]:.3g}")
-    # In units of the states' own sigmas, so that an exact state keeps its zeros, and rounding does not lose a small one.
+    # In units of the states' own sigmas, so that an exact state keeps its zeros and a small one its digits.
     sigma = np.sqrt(np.maximum(P.diagonal(), 0.0))
     per_sigma = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
     values, vectors = np.linalg.eigh(P * per_sigma[:, None] * per_sigma)
