@@ -1,9 +1,9 @@
-"""Pure. Geometry of a telescope mirror: surface, panels, rim, and the frames between the world and the robot.
+"""Geometry of a telescope mirror: surface, panels, rim, and the frames from the world to the robot. Pure.
 
 * *world*: inertial, origin at the intersection of the M1 boresight axis and the M2 elevation axis; z is the direction
-  in which light enters, that is down when the telescope points to the zenith.
+  in which light enters: down when the telescope points to the zenith.
 * *mirror*: the frame in which thesis eq. 1.1 is written; p_mirror = R (p_world - origin).
-* *deck*: the mirror frame, turned by pi about y where the robot drives on the -z side (M1). +z is the drive side, +x
+* *deck*: the mirror frame, turned by pi about y if the robot drives on the -z side (M1). +z is the drive side, +x
   the direction of increasing column, +y of increasing row. Maps, plans and the truth use its (x, y) projection.
 * *panel*: origin on the surface at the panel's centre, axes (e1, n x e1, n) of the tangent frame there.
 * *robot*: origin between the wheels on the surface, x along the heading, y to the left, z along the normal.

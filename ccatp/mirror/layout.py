@@ -43,7 +43,7 @@ class PanelGrid:
         return x, (panel.row - (self.rows + 1) / 2.0) * self._pitch_y + self._y_offset
 
     def panel_at(self, x: float, y: float) -> PanelId | None:
-        """The panel whose cell (half gaps included) holds the point, or None outside every cell."""
+        """The panel whose cell (with half of the gaps) contains the point, or None."""
         u, v = x * self._per_x + self._u0, y * self._per_y + self._v0
         if not (0.0 <= u < self.cols and 0.0 <= v < self.rows):  # NaN included
             return None
@@ -51,7 +51,7 @@ class PanelGrid:
         return self._ids[r][c] if self._first[r] <= c < self._end[r] else None
 
     def is_on_panel(self, x: float, y: float) -> bool:
-        """Whether there is material at the point: inside a panel's own edges."""
+        """Whether the point is on a panel, not over a gap."""
         u, v = x * self._per_x + self._u0, y * self._per_y + self._v0
         if not (0.0 <= u < self.cols and 0.0 <= v < self.rows):  # NaN included
             return False
@@ -61,7 +61,7 @@ class PanelGrid:
         return abs(u - c - 0.5) <= self._half_u and abs(v - r - 0.5) <= self._half_v
 
     def nearest_panel(self, x: float, y: float) -> PanelId:
-        """The panel under the point, or the one whose cell is nearest to it."""
+        """The panel whose cell contains the point or is nearest to it."""
         found = self.panel_at(x, y)
         if found is not None:
             return found
@@ -76,7 +76,7 @@ class PanelGrid:
         return best
 
     def nearest_seam(self, x: float, y: float) -> Seam | None:
-        """The nearest of the interior seams (panels on both sides) that bound the nearest cell; None without any."""
+        """The nearest of the interior seams (with panels on both sides) at the nearest cell; None without any."""
         panel = self.nearest_panel(x, y)
         r, c = panel.row - 1, panel.col - 1
         x0, y0 = (c - self._u0) * self._pitch_x, (r - self._v0) * self._pitch_y
@@ -107,7 +107,7 @@ POINTS_PER_ROW = 3
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A panel and its frame (thesis fig. 2.2), the tangent frame at its centre: it and half sizes in the deck plane, m.
+    """A panel: centre and half sizes in the deck plane, m, and its frame, the tangent frame there (thesis fig. 2.2).
 
     ``origin``: surface point at the centre, deck frame, m; ``axes``: the panel's x, y, z as unit vectors in the deck
     frame.

@@ -1,4 +1,4 @@
-"""The mirror as the robot meets it: surface, frames, panels, rim and poses."""
+"""The geometry of a mirror for the robot: surface, frames, panels, rim and poses."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -20,7 +20,7 @@ class Mirror:
     It stands in the world by p_mirror = R (p_world - origin), R = [[1, 0, 0], [0, c, s], [0, -s, c]]; the deck frame is
     the mirror frame turned by pi about its y axis where ``drive_side`` is -1, else the mirror frame. ``surface`` is in
     the deck frame, ``rim`` in the deck plane, ``collimators_m`` (k, 3) of the laser ``channels`` in the world frame.
-    ``gravity_deck`` is the unit vector along which things fall.
+    ``gravity_deck``: unit vector of gravity.
     """
 
     def __init__(self, cfg: MirrorConfig) -> None:
@@ -44,7 +44,7 @@ class Mirror:
         self._points_x = tuple(x * 1e-3 for x in cfg.panels.points_x_mm)
         self._points_y = tuple(y * 1e-3 for y in cfg.panels.points_y_mm)
         self._adjusters = {
-            # The data give offsets along the axes of the mirror frame; the deck's x runs against them on M1.
+            # The data have offsets along the axes of the mirror frame; on M1 the deck's x has the opposite direction.
             name: (self.drive_side * x * 1e-3, y * 1e-3)
             for name, (x, y) in cfg.panels.adjusters_mm.items()
         }
@@ -60,7 +60,7 @@ class Mirror:
         self.base_pose = self.deck_pose(self.base_panel_pose)
 
     def deck_from_mirror(self, p: Vector3) -> Vector3:
-        """Deck coordinates of a point given in the mirror frame, m; and the other way round."""
+        """Deck coordinates of a point given in the mirror frame, m; also the inverse."""
         return p if self.drive_side > 0 else (-p[0], p[1], -p[2])
 
     mirror_from_deck = deck_from_mirror
@@ -95,16 +95,16 @@ class Mirror:
         return self.deck_from_mirror((x, self.c * y + self.s * z, self.c * z - self.s * y))
 
     def panel(self, panel: PanelId) -> Panel:
-        """The panel of that row and column; raises ``UnknownPanelError``."""
+        """The panel with this row and column; raises ``UnknownPanelError``."""
         try:
             return self.panels[panel]
         except KeyError:
             raise UnknownPanelError(f"{self.name} has no panel in row {panel[0]}, column {panel[1]}") from None
 
     def point_on_deck(self, pid: PointId) -> tuple[float, float]:
-        """Deck (x, y) of a measurement point (thesis fig. 2.2), its nominal offset dropped along the panel's normal, m.
+        """Deck (x, y) of a measurement point (thesis fig. 2.2), m; raises ``UnknownPanelError``, also for its number.
 
-        Raises ``UnknownPanelError``, also for a number outside 1 to 9.
+        The nominal offset in the panel's plane is projected on the surface along the panel's normal.
         """
         if not 1 <= pid.point <= POINTS_PER_PANEL:
             raise UnknownPanelError(f"measurement point {pid.point} of panel {pid[:2]}: numbers run from 1 to 9")
@@ -189,7 +189,7 @@ class Mirror:
         return wrap_pi(atan2(ty, tx) + (-pi / 2.0 if axis == "x" else pi / 2.0))
 
     def gravity_in_robot(self, p: DeckPose) -> Vector3:
-        """Unit vector along which things fall, in the frame of a robot at ``p``."""
+        """Unit vector of gravity in the frame of a robot at ``p``."""
         gx, gy, gz = self.gravity_deck
         (hx, hy, hz), (lx, ly, lz), (nx, ny, nz) = self.robot_axes(p)
         return hx * gx + hy * gy + hz * gz, lx * gx + ly * gy + lz * gz, nx * gx + ny * gy + nz * gz
@@ -204,17 +204,17 @@ def _dot(a: Vector3, b: Vector3) -> float:
 
 
 def build_mirror(cfg: MirrorConfig) -> Mirror:
-    """Geometry of a mirror of a checked configuration."""
+    """The geometry of a mirror from its validated configuration."""
     return Mirror(cfg)
 
 
-# Along the panel's normal down to the surface. It starts at the sag of some mm, on which the slope hardly changes: the
-# first step of Newton's leaves 2e-7 m, the second less than rounding.
+# Newton steps along the panel's normal to the surface. They start at most some mm away, where the slope is almost the
+# same: the first step leaves 2e-7 m, the second less than rounding.
 _DROP_STEPS = 2
 
 
 def deck_rows(mirror: Mirror, panels: Sequence[tuple[int, int]], places: FloatArray) -> FloatArray:
-    """``Mirror.deck_pose`` of many: deck x, y (m), heading (rad) and height there (m), shape (k, 4).
+    """``Mirror.deck_pose`` of many poses: deck x, y (m), heading (rad) and height (m), shape (k, 4).
 
     ``places`` (k, 3) are x, y (m) and heading (rad) in the frames of the panels (row, column).
     """

@@ -28,7 +28,7 @@ ENOUGH = 3  # points of a plane
 
 
 class Undetermined(NamedTuple):
-    """A panel whose fixes do not determine how it lies; ``why`` completes its line."""
+    """A panel whose fixes do not determine its alignment; ``why``: end of its line in the report."""
 
     panel: PanelId
     points: int
@@ -37,10 +37,10 @@ class Undetermined(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurveyResult:
-    """How the panels of a mirror lie, rows then columns.
+    """Alignment of the panels of a mirror, sorted by row and column.
 
-    ``wavefront`` is with rigid moves (None without a fitted panel), ``wavefront_bent`` with moves that bend (None where
-    a panel has too few points for them); ``price`` of outliers and shapes.
+    ``wavefront``: with rigid moves (None without a fitted panel); ``wavefront_bent``: with moves that bend the panels
+    (None if a panel has too few points for them); ``price``: of outliers and shapes.
     """
 
     panels: tuple[PanelResult, ...]
@@ -58,7 +58,7 @@ def survey_result(
     measured: Iterable[Measured],
     planned: Iterable[PanelId],
 ) -> SurveyResult:
-    """Fit every panel; a ``planned`` one without enough fixes is listed as not determined."""
+    """Fit every panel; a ``planned`` panel without enough fixes is listed as undetermined."""
     warnings: list[str] = []
     by_panel: dict[PanelId, list[Measured]] = {panel: [] for panel in sorted(set(planned))}
     for one in measured:
@@ -97,7 +97,7 @@ def survey_result(
 def _deviations(
     mirror: Mirror, cfg: AlignConfig, puck_height_m: float, panel: PanelId, measured: Sequence[Measured]
 ) -> tuple[Deviations | None, str]:
-    """Deviations that can be fitted, or why there are none."""
+    """Deviations that can be fitted, or None and the reason."""
     if len(measured) < ENOUGH:
         return None, f"{len(measured)} of {ENOUGH} points that it takes"
     try:
@@ -127,10 +127,10 @@ BAND = 0.99
 
 
 class Comparison(NamedTuple):
-    """Recovered minus injected, over all panels that could be fitted; tip and tilt together.
+    """Fitted minus simulated misalignment over all panels that could be fitted; tip and tilt together.
 
-    ``chi2``: sum of ``e^T C^-1 e`` over the panels, e the three differences and C their covariance; ``low`` and
-    ``high`` bound it with 99 % probability where the stated covariances are right.
+    ``chi2``: sum of ``e^T C^-1 e`` over the panels, with the three differences e and their covariance C. ``low`` and
+    ``high``: its 99 % interval if the covariances are right.
     """
 
     panels: int
@@ -143,12 +143,12 @@ class Comparison(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """The chi-square lies in its band."""
+        """Whether the chi-square lies in its interval."""
         return self.low <= self.chi2 <= self.high
 
 
 def compare(panels: Sequence[PanelResult], injected: Mapping[PanelId, Vector3]) -> Comparison | None:
-    """Compare with the simulated misalignment; None without a panel of which both are known."""
+    """Compare with the simulated misalignment; None if no panel has both."""
     known = [panel for panel in panels if panel.panel in injected]
     if not known:
         return None

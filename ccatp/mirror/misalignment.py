@@ -1,4 +1,4 @@
-"""Misalignment of panels: rigid, by piston + tilt x + tip y along the panel's normal, and the puck on such a panel."""
+"""Rigid misalignment of panels, piston + tilt x + tip y along the panel's normal, and the puck on such a panel."""
 
 from dataclasses import dataclass
 from math import sqrt
@@ -9,7 +9,7 @@ from ccatp.mirror.mirror import Mirror
 
 @dataclass(frozen=True, slots=True)
 class PanelMisalignment:
-    """Rigid misalignment of a panel against the ideal surface, in the panel frame.
+    """Rigid misalignment of a panel relative to the ideal surface, in the panel frame.
 
     ``piston_m`` > 0 towards the robot; ``tip_rad`` and ``tilt_rad``: slope of the displacement along y and along x.
     """
@@ -26,9 +26,9 @@ class PanelMisalignment:
 def misaligned_puck_world(
     mirror: Mirror, panel: PanelId, misalignment: PanelMisalignment, p: DeckPose, height_m: float
 ) -> Vector3:
-    """World position of the puck's centre while the robot stands on a misaligned panel, ``p`` before the displacement.
+    """World position of the puck's centre when the robot stands on a misaligned panel; ``p``: pose on the ideal one.
 
-    The surface normal turns with the panel to first order. Raises ``UnknownPanelError``.
+    The surface normal turns with the panel, to first order. Raises ``UnknownPanelError``.
     """
     body = mirror.panel(panel)
     point = mirror.surface.point(p.x_m, p.y_m)

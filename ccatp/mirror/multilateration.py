@@ -1,4 +1,4 @@
-"""Position from ranges to known anchors: damped Gauss-Newton, covariance, dilution of precision; fix of the puck."""
+"""Position from ranges to known anchors by damped Gauss-Newton, with covariance and DOP; fix of the puck."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 from ccatp.config.models import EtalonConfig
 from ccatp.core import Fix, FloatArray, Vector3
 
-_RANK_TOLERANCE = 1e-6  # smallest over largest singular value of H: below it the position is not determined
-_COPLANAR_TOLERANCE = 1e-9  # the same ratio for the anchors about their centroid: they lie in a plane (2-D: on a line)
-_FIRST_DAMPING = 1e-6  # of the mean diagonal of H^T W H: as good as Gauss-Newton, yet solvable where H loses rank
+_RANK_TOLERANCE = 1e-6  # smallest over largest singular value of H, below which the position is not determined
+_COPLANAR_TOLERANCE = 1e-9  # likewise of the anchors about their centroid, below which they lie in a plane (2-D: line)
+_FIRST_DAMPING = 1e-6  # part of the mean diagonal of H^T W H; small, but the system stays solvable if H loses rank
 
 
 class MultilaterationError(ValueError):
-    """No position that can be used. The message says why, with the numbers."""
+    """The ranges give no valid position. The message has the reason with numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +45,9 @@ def multilaterate(
 ) -> RangeSolution:
     """Weighted least squares position from ranges (m,) to anchors (m, d), d = 2 or 3; see docs/mathematics.md.
 
-    Damped Gauss-Newton from ``expected_m`` on: the damping falls tenfold after a step that lessens the sum and rises
-    tenfold after one that does not (Levenberg 1944). Anchors in one plane (in two dimensions: on one line) see two
-    mirror images of the position equally well: the one on the expected position's side is returned.
+    Damped Gauss-Newton, starting at ``expected_m``: the damping falls tenfold after a step that reduces the sum of
+    squares, and rises tenfold otherwise (Levenberg 1944). For anchors in one plane (in two dimensions: on one line)
+    there are two solutions, mirror images of each other; the one on the side of the expected position is returned.
 
     Raises ``ValueError`` (shapes, numbers that are not finite, sigmas that are not positive) and
     ``MultilaterationError``: too few ranges, a degenerate geometry, no convergence.
@@ -98,7 +98,7 @@ def _geometry(anchors: FloatArray, position: FloatArray) -> tuple[FloatArray, Fl
     """Distances (m,) and unit vectors (m, d) from the anchors to the position: the Jacobian H."""
     offsets = position - anchors
     distances = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
-    # At an anchor the direction is undefined: a zero row leaves that range out of this step.
+    # At an anchor the direction is undefined; a zero row leaves this range out of the step.
     return distances, offsets / np.maximum(distances, 1e-12)[:, None]
 
 
@@ -139,7 +139,7 @@ def _iterate(
 
 
 def _on_side_of(start: FloatArray, position: FloatArray, anchors: FloatArray) -> FloatArray:
-    """The mirror image of ``position`` that lies on the side of ``start``, where the anchors lie in a plane."""
+    """The position or, if the anchors lie in a plane, its mirror image on the side of ``start``."""
     centroid = anchors.mean(axis=0)
     _, singular, axes = np.linalg.svd(anchors - centroid)
     if singular[-1] > _COPLANAR_TOLERANCE * singular[0]:
@@ -158,13 +158,13 @@ def solve_fix(
     lengths_m: Mapping[int, float],
     collimators_m: Mapping[int, FloatArray],
 ) -> Fix:
-    """Multilaterate the puck, each length with sigma = length_sigma_m + length_sigma_per_m * length, and check it.
+    """Multilaterate the puck, each length with sigma = length_sigma_m + length_sigma_per_m * length. World frame.
 
-    World frame throughout. Raises ``MultilaterationError``: no solution, or one past a limit.
+    Raises ``MultilaterationError``: no solution, or one that exceeds a configured limit.
     """
     ranges_m = np.array(tuple(lengths_m.values()))
     sigmas_m = cfg.length_sigma_m + cfg.length_sigma_per_m * ranges_m
-    anchors_m = np.array([collimators_m[channel] for channel in lengths_m]).reshape(-1, 3)  # none is too few, too
+    anchors_m = np.array([collimators_m[channel] for channel in lengths_m]).reshape(-1, 3)  # also without any
     solution = multilaterate(anchors_m, ranges_m, sigmas_m, expected_m)
     residual_m = float(np.max(np.abs(solution.residuals_m)))
     if not residual_m <= cfg.max_residual_m:

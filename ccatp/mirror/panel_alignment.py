@@ -1,8 +1,8 @@
 """The alignment of one panel: deviations, modes, adjuster moves, outliers and shape, half-wavefront error.
 
-The displacement along a panel's normal is ``D(x, y) = sum c_i m_i(x, y)``: ``rigid`` modes (as in ``misalignment``),
-``quadratic`` ones, whose coefficients are the curvatures D_xx, D_xy, D_yy, or ``adjustable`` ones, twist and bowl,
-which five adjusters can bend. docs/align.md has the method: outliers and shape, moves, half-wavefront error.
+The displacement along a panel's normal is ``D(x, y) = sum c_i m_i(x, y)`` with ``rigid`` modes (as in
+``misalignment``), ``quadratic`` modes with the curvatures D_xx, D_xy, D_yy as coefficients, or ``adjustable`` modes,
+twist and bowl, which five adjusters can change. The method is in docs/align.md.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,8 +31,8 @@ class Deviations(NamedTuple):
     """The measured points of one panel, in the order of their numbers.
 
     ``places_m`` (k, 2) in the panel frame and ``deck_m`` (k, 2) are the surface points under the puck, ``values_m``
-    (k,) the deviations along the local normal, > 0 towards the robot. ``lever`` (k,): local normal times the panel's; a
-    displacement D along the panel's normal is a deviation of D times this.
+    (k,) the deviations along the local normal, > 0 towards the robot. ``lever`` (k,): scalar product of the local and
+    the panel's normal, the deviation per displacement D along the panel's normal.
     """
 
     points: tuple[PointId, ...]
@@ -48,8 +48,8 @@ def deviations_of(
 ) -> Deviations:
     """Deviations of the points of a panel; their variance is ``n^T C n + floor^2``.
 
-    An error of the fix sideways moves along the surface. ``floor_m`` is what the covariance of a fix does not know,
-    point by point. Raises ``UnknownPanelError``, and ``ConvergenceError`` far from the mirror.
+    A lateral error of the fix only moves the point along the surface. ``floor_m``: independent error of each point that
+    the covariance of its fix does not include. Raises ``UnknownPanelError``, ``ConvergenceError`` far from the mirror.
     """
     chosen = sorted(measured, key=lambda one: one.point)
     body = mirror.panel(panel)
@@ -72,8 +72,8 @@ def deviations_of(
 
 Modes = Callable[[FloatArray], FloatArray]
 
-MAX_CONDITION = 1e4  # of columns of unit length; nine points of a panel give less than 10, points on a line infinity
-_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(4)  # exact for the products of quadratics
+MAX_CONDITION = 1e4  # with columns of unit length; nine points of a panel give less than 10, points on a line infinity
+_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(4)  # exact for products of quadratics
 
 
 def rigid(places_m: FloatArray) -> FloatArray:
@@ -97,7 +97,7 @@ def adjustable(places_m: FloatArray) -> FloatArray:
 class ModeFit(NamedTuple):
     """Coefficients (m,) by weighted least squares, in m, rad and 1/m, with their covariance (m, m) and residuals (k,).
 
-    ``residual_variance_m2``: mean square of the residuals that the points' own uncertainty makes one expect.
+    ``residual_variance_m2``: expected mean square of the residuals from the uncertainty of the points.
     """
 
     values: FloatArray
@@ -114,14 +114,14 @@ class ModeFit(NamedTuple):
 
     @property
     def unexplained_m2(self) -> float:
-        """Mean square of the residuals beyond what the points' uncertainty explains; by chance < 0."""
+        """Mean square of the residuals minus its expected value; may be < 0 by chance."""
         return float(np.mean(self.residuals_m**2)) - self.residual_variance_m2
 
 
 def fit_modes(design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray) -> ModeFit | None:
-    """Weighted least squares by QR; None where the points do not determine the coefficients.
+    """Weighted least squares by QR; None if the points do not determine the coefficients.
 
-    ``design`` (k, m): modes at the points, each row times the point's lever; deviations and sigmas > 0 of shape (k,).
+    ``design`` (k, m): modes at the points, each row times the point's lever; deviations and sigmas > 0, shape (k,).
     """
     count, modes = design.shape
     if count < modes:
@@ -135,13 +135,13 @@ def fit_modes(design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray) ->
     solution = np.linalg.solve(r, q.T @ target)
     spread = np.linalg.solve(r, np.eye(modes))
     left = target - whitened @ solution
-    # The whitened residuals are (1 - Q Q^T) times unit noise; the trace of its square is that of itself.
+    # The whitened residuals are the projection 1 - Q Q^T of unit noise.
     expected = float(np.mean(sigmas_m**2 * (1.0 - np.sum(q * q, axis=1))))
     return ModeFit(solution, spread @ spread.T, left * sigmas_m, expected, float(left @ left), count - modes)
 
 
 def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
-    """Mean G of the products of the modes over a panel of half sizes ``half_m``: c^T G c is the mean square of D."""
+    """Mean G of the products of modes over a panel with half sizes ``half_m``; c^T G c is the mean square of D."""
     x, y = np.meshgrid(_NODES * half_m[0], _NODES * half_m[1])
     weights = np.outer(_NODE_WEIGHTS, _NODE_WEIGHTS).ravel() / 4.0
     at = modes(np.column_stack([x.ravel(), y.ravel()]))
@@ -149,7 +149,7 @@ def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
 
 
 class Moves(NamedTuple):
-    """Moves (a,) in the order of the adjusters' names; covariance (a, a), of the rank of the modes."""
+    """Moves (a,) in the order of the adjusters' names; covariance (a, a), whose rank is that of the modes."""
 
     values_m: FloatArray
     covariance_m2: FloatArray
@@ -169,34 +169,34 @@ def adjuster_places(mirror: Mirror, panel: PanelId) -> tuple[tuple[str, ...], Fl
 
 
 def adjuster_moves(fit: ModeFit, modes: Modes, places_m: FloatArray) -> Moves:
-    """Moves that take a fitted displacement away, of adjusters at (x, y) in the panel frame, shape (a, 2), m."""
+    """Moves that remove a fitted displacement; ``places_m``: adjusters in the panel frame, shape (a, 2), m."""
     at = -modes(places_m)
     return Moves(at @ fit.values, at @ fit.covariance @ at.T)
 
 
 _CURVATURES = 3
-# Points beyond those that a fit takes, for each that is left out. With fewer, some choice of points always fits.
+# Number of redundant points required for each point left out. With fewer, some selection of points always fits.
 REDUNDANCY = 3
 
 
 class Prices(NamedTuple):
-    """Chi-square that has to be gained by leaving a point out, and by the three curvatures of a panel."""
+    """Least reduction of the chi-square to leave out a point, and to use the three curvatures of a panel."""
 
     outlier: float
     shape: float
 
 
 def prices(false_alarm: float, points: int, panels: int) -> Prices:
-    """What an explanation costs; ``false_alarm``: chance of an outlier, or a shape, by noise on the whole mirror."""
+    """The prices for a ``false_alarm`` probability of an outlier, or of a shape, by noise on the whole mirror."""
     return Prices(
         float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, false_alarm / max(panels, 1)))
     )
 
 
 def explain(deviations: Deviations, price: Prices) -> tuple[BoolArray, bool]:
-    """The cheapest explanation of a panel's deviations: which points count, and whether the curvatures are significant.
+    """The cheapest explanation of a panel's deviations: which points are kept, and whether curvatures are significant.
 
-    A panel that cannot be fitted, or has hardly more points than it takes, keeps all of them.
+    All points are kept if the panel cannot be fitted, or has too few redundant points.
     """
     count = len(deviations.points)
     target = deviations.values_m / deviations.sigmas_m
@@ -225,16 +225,16 @@ def _subsets(count: int, most: int) -> Iterator[BoolArray]:
 
 
 def _chi2(whitened: FloatArray, target: FloatArray) -> float:
-    """What least squares leave; infinite where the points do not determine the coefficients."""
+    """Least sum of squares; infinite if the points do not determine the coefficients."""
     solution, _, rank, _ = np.linalg.lstsq(whitened, target, rcond=1.0 / MAX_CONDITION)
     left = target - whitened @ solution
     return float(left @ left) if rank == whitened.shape[1] else np.inf
 
 
 class PanelWavefront(NamedTuple):
-    """One panel's part: mean squares of the half-wavefront error as fitted, unexplained (u, may be < 0) and of noise.
+    """One panel's mean squares of the half-wavefront error: fitted, of the fit's uncertainty, unexplained, of noise.
 
-    ``mean_m``: mean of the half-wavefront error before the moves.
+    The unexplained part may be < 0. ``mean_m``: mean half-wavefront error before the moves.
     """
 
     weight_m2: float
@@ -248,8 +248,8 @@ class PanelWavefront(NamedTuple):
 class MirrorWavefront(NamedTuple):
     """Root mean squares over all panels that could be fitted, m.
 
-    ``before_level_m`` is without the mean over the beam, a path that all light shares; ``after_m`` is predicted;
-    ``noise_m`` is of a single point: a survey after the moves shows this and ``after_m``, added in squares.
+    ``before_level_m``: without the mean over the beam, which is common to all light. ``after_m``: predicted for after
+    the moves. ``noise_m``: of a single point; a survey after the moves shows the root sum of squares of both.
     """
 
     before_m: float
@@ -259,11 +259,11 @@ class MirrorWavefront(NamedTuple):
 
 
 def cos_incidence(mirror: Mirror, panel: PanelId, light: LightConfig | None) -> float:
-    """Cosine of the angle between a panel's normal and the light at its centre; 1 where the light is unknown."""
+    """Cosine of the angle between a panel's normal and the light at its centre; 1 without ``light``."""
     if light is None:
         return 1.0
     body = mirror.panel(panel)
-    # From the panel to where the rays meet, times the vergence: for parallel light the direction itself.
+    # Vector from the panel to the focus of the rays, times the vergence; for parallel light the direction itself.
     direction = np.array(light.direction_world)
     direction /= np.linalg.norm(direction)
     offset = np.array(mirror.world_from_deck(body.origin)) - mirror.world_from_mirror((0.0, 0.0, 0.0))
@@ -273,7 +273,7 @@ def cos_incidence(mirror: Mirror, panel: PanelId, light: LightConfig | None) -> 
 
 
 def half_size_m(panel: Panel) -> tuple[float, float]:
-    """Half a panel's size along its own x and y: its deck size over the cosines of the slopes."""
+    """Half a panel's size along its own x and y: half the deck size over the cosines of the slopes."""
     return panel.half_x_m / panel.axes[0][0], panel.half_y_m / panel.axes[1][1]
 
 
@@ -304,12 +304,12 @@ def mirror_wavefront(panels: Iterable[PanelWavefront]) -> MirrorWavefront | None
     return MirrorWavefront(sqrt(fitted + left), sqrt(level), sqrt(uncertain + left), sqrt(noise))
 
 
-# Of one row of points the tolerance of their arrivals, 10 mm, would make a plane: one with tilts of some 0.1 rad.
+# Least spread of the points. A single row, with an arrival tolerance of 10 mm, would give tilts of about 0.1 rad.
 _MIN_SPREAD_M = 0.02
 
 
 def fit_panels(mirror: Mirror, measured: Iterable[Measured], puck_height_m: float) -> dict[PanelId, Vector3]:
-    """Piston (m), tip and tilt (rad) of every panel whose points span it; for the summary of a survey."""
+    """Piston (m), tip and tilt (rad) of every panel with enough points, for the summary of a survey."""
     by_panel: dict[PanelId, list[Measured]] = {}
     for one in measured:
         by_panel.setdefault(one.point.panel, []).append(one)
@@ -319,7 +319,7 @@ def fit_panels(mirror: Mirror, measured: Iterable[Measured], puck_height_m: floa
         centred = found.places_m - found.places_m.mean(axis=0)
         spread_m = float(np.linalg.svd(centred, compute_uv=False)[-1]) / sqrt(len(own))
         fit = fit_modes(found.lever[:, None] * rigid(found.places_m), found.values_m, found.sigmas_m)
-        if fit is not None and spread_m >= _MIN_SPREAD_M:  # else a survey that ended early
+        if fit is not None and spread_m >= _MIN_SPREAD_M:  # otherwise the survey ended early
             piston_m, tip_rad, tilt_rad = fit.values.tolist()
             fits[panel] = piston_m, tip_rad, tilt_rad
     return fits
@@ -329,7 +329,7 @@ SHAPE = slice(3, 6)
 
 
 class PanelShape(NamedTuple):
-    """Curvatures D_xx, D_xy, D_yy and their sigmas, 1/m, shape (3,); ``gain``: what they lessen the chi-square by."""
+    """Curvatures D_xx, D_xy, D_yy and their sigmas, 1/m, shape (3,); ``gain``: reduction of the chi-square."""
 
     values_1_m: FloatArray
     sigma_1_m: FloatArray
@@ -341,7 +341,7 @@ class PanelShape(NamedTuple):
 
 
 class AdjusterPlan(NamedTuple):
-    """Moves of the adjusters and what they make of the panel's half-wavefront error."""
+    """Moves of the adjusters, and the panel's half-wavefront error with them."""
 
     moves: Moves
     wavefront: PanelWavefront
@@ -349,11 +349,11 @@ class AdjusterPlan(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PanelResult:
-    """How a panel lies: rigid fit (piston, m; tip, tilt, rad), also where the panel is bent.
+    """Alignment of a panel: rigid fit (piston, m; tip, tilt, rad), also for a bent panel.
 
-    These are what the adjusters can take away without bending the panel, and half as uncertain as beside three
-    curvatures. ``is_kept`` (k,): the points that are not outliers. ``shape`` and ``bending`` (moves that take twist and
-    bowl away, too) are None with fewer points than they take.
+    The adjusters can correct these without bending the panel, and their uncertainty is half of that in a fit with three
+    curvatures. ``is_kept`` (k,): the points that are not outliers. ``shape``, and ``bending`` (moves that also remove
+    twist and bowl), are None if there are too few points.
     """
 
     panel: PanelId
@@ -368,24 +368,24 @@ class PanelResult:
 
     @property
     def outliers(self) -> tuple[PointId, ...]:
-        """Points that were left out."""
+        """The points left out."""
         return tuple(p for p, kept in zip(self.deviations.points, self.is_kept, strict=True) if not kept)
 
     @property
     def model(self) -> "ModeFit | PanelShape":
-        """The chosen model, with ``chi2`` and ``dof`` that it leaves."""
+        """The chosen model, with its ``chi2`` and ``dof``."""
         return self.shape if self.shape is not None and self.shape.is_significant else self.fit
 
     @property
     def probability(self) -> float:
-        """That the points' uncertainty alone gives what the chosen model leaves, or more."""
+        """Probability that the points' uncertainty alone gives this chi-square of the chosen model, or a larger one."""
         return float(chdtrc(self.model.dof, self.model.chi2)) if self.model.dof > 0 else 1.0
 
 
 def panel_result(
     mirror: Mirror, panel: PanelId, deviations: Deviations, price: Prices, cos_i: float
 ) -> PanelResult | None:
-    """Fit a panel; None where its points do not determine piston, tip and tilt."""
+    """Fit a panel; None if its points do not determine piston, tip and tilt."""
     kept, has_shape = explain(deviations, price)
     places, lever = deviations.places_m[kept], deviations.lever[kept, None]
     values, sigmas = deviations.values_m[kept], deviations.sigmas_m[kept]
@@ -421,7 +421,7 @@ def panel_result(
 
 
 def on_grid_m(mirror: Mirror, panel: PanelResult, cells: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The displacement along the panel's normal in a grid of cells, with curvatures where they are significant.
+    """The displacement along the panel's normal on a grid of cells, with the curvatures if they are significant.
 
     Edges along deck x and deck y (cells + 1,), values (cells, cells), rows along x, m.
     """
@@ -433,7 +433,7 @@ def on_grid_m(mirror: Mirror, panel: PanelResult, cells: int) -> tuple[FloatArra
     places = np.array([body.from_deck(mirror.surface.point(*place))[:2] for place in deck])
     found = rigid(places) @ panel.fit.values
     if panel.shape is not None and panel.shape.is_significant:
-        # The rigid fit has taken the mean of the curvatures' part away; so does what is drawn.
+        # The rigid fit includes the mean of the curvatures' part, so it is subtracted here.
         bend = quadratic(places)[:, 3:] @ panel.shape.values_1_m
         found += bend - bend.mean()
     return x, y, found.reshape(cells, cells)

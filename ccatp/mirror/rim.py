@@ -1,6 +1,6 @@
-"""The rim: outline of the union of the panels with the seams filled, as a signed distance in the deck plane, m.
+"""The rim: outline of the panels with the seams filled, as a signed distance in the deck plane, m.
 
-The outline is rectilinear and mirror-symmetric about x = 0; only a few of its edges count near a place.
+The outline is rectilinear and symmetric about x = 0. Near a place, only a few of its edges matter.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from ccatp.mirror.surface import MirrorError
 Span = tuple[float, float, float]
 
 _ROUNDING_M = 1e-9
-_BOX_M = 0.25  # half the side of the square for which edges are picked at a time
+_BOX_M = 0.25  # half the side of the square for which edges are selected
 
 
 class Outline:
@@ -58,9 +58,9 @@ class Outline:
     def part(self, x: float, y: float, radius_m: float) -> "Outline":
         """The edges that decide the signed distance of a point within ``radius_m`` of (x, y).
 
-        A distance changes by at most the way travelled: what lies further from the centre than the nearest edge by
-        more than twice the radius is nearest to no point of the disc. An upright edge separates inside and beyond, too,
-        wherever its slab reaches into the disc.
+        A distance changes by at most the way travelled. So an edge that is further from the centre than the nearest one
+        by more than twice the radius is nearest to no point of the disc. An upright edge is also kept if its slab
+        reaches into the disc, because it separates inside from outside.
         """
         limit_m = abs(self.signed_distance_m(x, y)) + 2.0 * radius_m + _ROUNDING_M
         x = abs(x)
@@ -74,7 +74,7 @@ class Outline:
 
 
 class NearOutline:
-    """Signed distances of places that stay near each other for a while: only the edges around them are looked at."""
+    """Signed distances of places that follow each other closely, from the edges near them only."""
 
     __slots__ = ("_outline", "_part", "_x_m", "_y_m")
 
@@ -83,10 +83,10 @@ class NearOutline:
         self._x_m = self._y_m = inf
 
     def signed_distance_m(self, x: float, y: float) -> float:
-        """As ``Outline.signed_distance_m``, the same to the last bit."""
+        """As ``Outline.signed_distance_m``, equal to the last bit."""
         if not (-_BOX_M < x - self._x_m < _BOX_M and -_BOX_M < y - self._y_m < _BOX_M):
             self._x_m, self._y_m = x, y
-            self._part = self._outline.part(x, y, 1.5 * _BOX_M)  # the square's corners, and some
+            self._part = self._outline.part(x, y, 1.5 * _BOX_M)  # a disc that contains the square
         return self._part.signed_distance_m(x, y)
 
 
@@ -101,7 +101,7 @@ _CLEARANCE_TOLERANCE_M = 1e-9
 
 
 class Rim(Outline):
-    """Outline with stepped corners of a whole mirror along the panels' outer edges; distances > 0 on the mirror.
+    """Outline of a whole mirror along the panels' outer edges, with stepped corners; distances > 0 on the mirror.
 
     ``vertices``: corners counter-clockwise, shape (n, 2), deck plane, m.
     """
@@ -109,7 +109,7 @@ class Rim(Outline):
     __slots__ = ("_boxes", "_edges", "vertices")
 
     def __init__(self, slabs: Sequence[Span]) -> None:
-        """Slabs (half width, low y, high y) from low to high y; each begins where the one before ends."""
+        """Slabs (half width, low y, high y) from low to high y, without gaps."""
         widths = [0.0, *(half for half, _, _ in slabs), 0.0]
         levels = [slabs[0][1], *(high for _, _, high in slabs)]
         steps = zip(levels, pairwise(widths), strict=True)
@@ -137,8 +137,8 @@ class Rim(Outline):
     def segment_clearance_m(self, x0: float, y0: float, x1: float, y1: float) -> float:
         """Least signed distance along the straight segment from (x0, y0) to (x1, y1), m, to 1 nm.
 
-        On the mirror this is the distance between the segment and the outline. Where the segment leaves the mirror it
-        is minus the largest distance beyond the rim. Raises ``MirrorError`` for a coordinate that is not finite.
+        On the mirror this is the distance between segment and outline. If the segment leaves the mirror, it is minus
+        the largest distance beyond the rim. Raises ``MirrorError`` for a coordinate that is not finite.
         """
         if not isfinite(x0 + y0 + x1 + y1):
             raise MirrorError(f"segment from ({x0}, {y0}) to ({x1}, {y1}) is not finite")
@@ -146,7 +146,7 @@ class Rim(Outline):
         if beyond > _CLEARANCE_TOLERANCE_M:
             return -beyond
         a, b = (x0, y0), (x1, y1)
-        # Segments that do not cross are nearest to each other at one of their ends.
+        # Two segments that do not cross are nearest to each other at one of their ends.
         return min(
             min(
                 to_segment_m(a, c, d),
@@ -160,8 +160,8 @@ class Rim(Outline):
     def _largest_excess_m(self, x0: float, y0: float, x1: float, y1: float) -> float:
         """Largest distance of a point of the segment from the mirror, 0 on it, by branch and bound.
 
-        The distance from one box is convex along the segment, so between two points the distance from the union is at
-        most the least over the boxes of the greater of the two end values.
+        The distance from a box is convex along the segment. So between two points the distance from the union is at
+        most the minimum over the boxes of the larger distance of the two points.
         """
         start, end = self._box_distances(x0, y0), self._box_distances(x1, y1)
         best = max(min(start), min(end))
@@ -199,7 +199,7 @@ def build_rim(grid: PanelGrid) -> Rim:
 
 def _maximal_boxes(slabs: Sequence[Span]) -> tuple[Box, ...]:
     """Largest boxes (half width, low, high) inside the outline; their union is the mirror."""
-    boxes: dict[Box, None] = {}  # as an ordered set: equal boxes of different slabs are one
+    boxes: dict[Box, None] = {}  # an ordered set, because different slabs may give equal boxes
     for k, (half, _, _) in enumerate(slabs):
         first = last = k
         while first > 0 and slabs[first - 1][0] >= half:

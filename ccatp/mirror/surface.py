@@ -1,4 +1,4 @@
-"""The polynomial surface of a mirror in the deck frame, thesis eq. 1.1; derivatives, normal, expansion, refusals."""
+"""The polynomial surface of a mirror in the deck frame, thesis eq. 1.1: derivatives, normal, local expansion."""
 
 from math import inf, sqrt
 
@@ -10,7 +10,7 @@ from ccatp.core import FloatArray, Vector3
 
 
 class MirrorError(ValueError):
-    """Base of every refusal of this room."""
+    """Base of the errors of this package."""
 
 
 class UnknownPanelError(MirrorError):
@@ -27,14 +27,14 @@ Third = tuple[float, float, float, float]
 
 _METRE_PER_MM = 1e-3
 _NEWTON_STEPS = 20
-_NEWTON_STEP_M = 1e-12  # Newton converges quadratically: a step this small leaves an error at rounding level
+_NEWTON_STEP_M = 1e-12  # Newton converges quadratically, so after such a step the error is at rounding level
 
 
 class Surface:
     """Height of the ideal mirror over the deck plane, ``f(x, y) = sum c_ij x^i y^j`` (thesis eq. 1.1, deck frame, m).
 
-    Scalar methods are nested Horner schemes in plain floats, because they run several times per control frame; the
-    methods in the plural take arrays.
+    Scalar methods use nested Horner schemes in plain floats, because they run several times per control frame. The
+    methods with plural names take arrays.
     """
 
     __slots__ = ("_coefficients", "_rows", "_slopes")
@@ -48,7 +48,7 @@ class Surface:
             raise ValueError(f"surface coefficients need shape (i, j), got {coefficients.shape}")
         self._coefficients = c = coefficients.astype(np.float64)
         self._slopes = polyder(c, axis=0), polyder(c, axis=1)
-        # Highest power first, as Horner's scheme consumes them; trailing zeros of each row are not stored.
+        # Highest power first, as for Horner's scheme, without the trailing zeros of each row.
         self._rows = tuple(tuple(np.trim_zeros(row, "b")[::-1].tolist()) for row in c[::-1])
 
     def height_m(self, x: float, y: float) -> float:
@@ -193,15 +193,15 @@ def build_surface(cfg: SurfaceConfig, drive_side: int) -> Surface:
     return Surface(coefficients)
 
 
-_ADJACENT, _AHEAD = 1.3, 0.75  # their product is less than 1: a place always lies within its own expansion
+_ADJACENT, _AHEAD = 1.3, 0.75  # their product is less than 1, so that a place always lies within its own expansion
 
 
 class SurfacePatch:
-    """Height, slopes and curvatures to third order in the way from the last expansion, at a quarter of the price.
+    """Height, slopes and curvatures by an expansion of third order, at a quarter of the cost of the polynomial.
 
-    What is left out belongs to the fourth derivatives, which stay below 1e-3 1/m^3 on these mirrors: within 5 mm a
-    height is off by less than 1e-12 m, a slope by less than 2e-10, a second derivative by less than 5e-8 1/m. An
-    expansion is used within ``reach_m`` in x and in y.
+    The error is that of the fourth derivatives, which stay below 1e-3 1/m^3 on these mirrors: within 5 mm a height is
+    off by less than 1e-12 m, a slope by less than 2e-10, a second derivative by less than 5e-8 1/m. An expansion is
+    used within ``reach_m`` in x and in y.
     """
 
     __slots__ = ("_jet", "_reach_m", "_surface", "_third", "_x_m", "_y_m")
@@ -219,7 +219,7 @@ class SurfacePatch:
             return self._expand(x, y)
         f, fx, fy, fxx, fxy, fyy = self._jet
         fxxx, fxxy, fxyy, fyyy = self._third
-        # Half of what the second derivatives change by: their mean on the way makes the slopes exact to this order.
+        # Half of the change of the second derivatives; with their means the slopes are exact to this order.
         hxx, hxy, hyy = 0.5 * (fxxx * dx + fxxy * dy), 0.5 * (fxxy * dx + fxyy * dy), 0.5 * (fxyy * dx + fyyy * dy)
         gx, gy = (fxx + hxx) * dx + (fxy + hxy) * dy, (fxy + hxy) * dx + (fyy + hyy) * dy
         bend = hxx * dx * dx + 2.0 * hxy * dx * dy + hyy * dy * dy
@@ -229,7 +229,7 @@ class SurfacePatch:
     def _expand(self, x: float, y: float) -> Jet:
         way_x, way_y, limit = x - self._x_m, y - self._y_m, _ADJACENT * self._reach_m
         if -limit < way_x < limit and -limit < way_y < limit:
-            # Whoever has just left the last square most likely goes on: the next one begins here.
+            # A robot that just left the last square probably drives on, so the next one is placed ahead of it.
             self._x_m, self._y_m = x + _AHEAD * way_x, y + _AHEAD * way_y
         else:
             self._x_m, self._y_m = x, y
