@@ -70,15 +70,14 @@ def slam(
     track = estimate(run, assumed, filter_name)
     common.warn(track.warnings)
     judged = judge(track, run)
-    data: dict[str, Any] = result_data(run, filter_name, track, judged) | reviewed(
-        run, track, getattr(assumed, run.kind).radio
-    )
+    noise = getattr(assumed, run.kind).radio
+    data: dict[str, Any] = result_data(run, filter_name, track, judged) | reviewed(run, track, noise)
     if tum_file is not None:
         _write_tum(tum_file, run, track)
     if figure_file is not None:
         from ccatp.report.beacon_plots import draw_slam
 
-        draw_slam(run, track, judged, figure_file, f"{run.name}, {filter_name}")
+        draw_slam(run, track, judged, noise.camera_field_rad, figure_file, f"{run.name}, {filter_name}")
     if peers:
         data["peers"] = compared(run, assumed, common.warn)
     if json_output:

@@ -497,6 +497,7 @@ class RadioNoiseConfig(Model):
 
     range_sigma_m: Positive
     range_sigma_per_m: NonNegative
+    camera_field_rad: Annotated[float, Field(ge=0.0, le=1.5)]  # half; 0: no camera
     bearing_sigma_rad: Positive
     rssi_sigma_db: Positive
     rssi_reference_dbm: Level

@@ -205,7 +205,9 @@ _BEACON_COLOURS = (_BLUE, _GOLD, _GREEN, _RED, "#b5478a", "#6b7785", "#7a3e00", 
 _TRUTH, _PATH, _MAP, _RECKONED = "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8"
 
 
-def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, out: Path, title: str) -> None:
+def draw_slam(
+    run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, camera_field_rad: float, out: Path, title: str
+) -> None:
     """Draw a track, laid on the truth if there is one."""
     beacons = {
         name: (np.array((fix.x_m, fix.y_m)), ellipse_outline(fix.covariance, SIGMAS))
@@ -220,7 +222,7 @@ def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, o
     half[0] = max(half[0], half[1] / 1.1)  # no picture is much taller than wide,
     half[1] = max(half[1], half[0] * 0.35)  # nor a stripe
     known = bool(np.isfinite(judged.errors_m).any())
-    residuals_m = range_residuals(run, track)
+    residuals_m = range_residuals(run, track, camera_field_rad)
     has_residuals = bool(np.isfinite(residuals_m).any())
     heights = [(WIDTH_PX / DPI - 0.8) * float(half[1] / half[0]), *([1.1] if known else [])]
     heights += [1.6] if has_residuals else []

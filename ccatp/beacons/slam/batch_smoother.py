@@ -236,10 +236,11 @@ def smooth(
     begin_s, first_radio = clock_s(), settings.radio
     steps_s = run.steps.times_s  # there is a pose at each reading, and at an odometry step now and then between them
     _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
-    times_s = np.union1d(run.readings.times_s, steps_s[first])
+    readings = run.readings.with_distances(settings.radio.camera_field_rad)
+    times_s = np.union1d(readings.times_s, steps_s[first])
     found = found or follow(run, settings, how, lambda: 0.0, SPACING_S)
     start, rest = _started(run, settings, found, times_s), (how.rest_speed_m_s, how.rest_turn_rad_s)
-    problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used, rest)
+    problem = BatchProblem(run.steps, readings, times_s, run.first_pose, settings, start.used, rest)
     counted = problem.sizes > 0
     off = problem.residuals(start.state).chi2[counted] / problem.sizes[counted]
     state, softness = start.state, float(np.median(off)) if counted.any() else 0.0
@@ -251,7 +252,7 @@ def smooth(
         if radio == problem.radio:
             break
         settings = settings.model_copy(update={"radio": radio})
-        problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used, rest)
+        problem = BatchProblem(run.steps, readings, times_s, run.first_pose, settings, start.used, rest)
         state, converged = descend(problem, state, ITERATIONS)
     took_s = clock_s() - begin_s
     weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)

@@ -161,7 +161,7 @@ def follow(
     search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, np.diag(np.square(sigmas))))
     window = None if lag is None else FixedLag(lag, search.best)
     times = np.union1d(_spaced(run.steps.times_s, finest_s), run.readings.times_s)
-    increments, readings = _increments(run.steps, times), list(_readings(run))
+    increments, readings = _increments(run.steps, times), list(_readings(run, cfg.radio.camera_field_rad))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
     log = _Log()
@@ -271,8 +271,8 @@ def _increments(steps: Steps, times_s: FloatArray) -> list[Increment]:
     return [Increment(*row) for row in zip(times_s[1:].tolist(), np.diff(times_s).tolist(), *amounts, strict=True)]
 
 
-def _readings(run: RecordedRun) -> Iterator[Reading]:
-    r = run.readings
+def _readings(run: RecordedRun, camera_field_rad: float) -> Iterator[Reading]:
+    r = run.readings.with_distances(camera_field_rad)
     for time_s, beacon, range_m, bearing_rad, rssi_dbm in zip(*(column.tolist() for column in r), strict=True):
         bearing = None if math.isnan(bearing_rad) else bearing_rad
         level_dbm = rssi_dbm if math.isnan(range_m) else math.nan

@@ -43,6 +43,21 @@ class Readings(NamedTuple):
             self.times_s[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows], self.rssi_dbm[rows]
         )
 
+    def with_distances(self, camera_field_rad: float) -> "Readings":
+        """The readings of a camera that ranges by apparent height, with distances in place of depths.
+
+        On a rectified image the height falls with the depth along the axis, r cos(bearing). ``camera_field_rad``: half
+        the field of view, over which such ranges are right in the mean; 0: ranges are distances, as they are where most
+        bearings lie outside the field.
+        """
+        off_axis = np.abs(self.bearing_rad)
+        seen = off_axis < 0.5 * np.pi
+        if camera_field_rad <= 0.0 or not seen.any() or np.nanmedian(off_axis) > camera_field_rad:
+            return self
+        mean = np.sin(camera_field_rad) / camera_field_rad  # of the cosine over the field
+        distances_m = self.range_m * mean / np.cos(self.bearing_rad, where=seen, out=np.ones(len(seen)))
+        return self._replace(range_m=np.where(seen, distances_m, self.range_m))
+
 
 class ReferencePath(NamedTuple):
     """Where the vehicle was, world frame."""

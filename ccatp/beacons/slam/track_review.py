@@ -15,11 +15,11 @@ _PLACES = 200  # along the path, at which a reading is considered
 _NONE = Calibrated(0.0, 0.0)
 
 
-def range_residuals(run: RecordedRun, track: EstimatedPath) -> FloatArray:
+def range_residuals(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -> FloatArray:
     """Calibrated ranges less those of path and map, m, shape (m,); NaN without a range or a beacon on the map."""
     nowhere = np.full(2, np.nan)
     places = np.array([track.beacons[name][:2] if name in track.beacons else nowhere for name in run.beacon_ids])
-    r = run.readings
+    r = run.readings.with_distances(camera_field_rad)
     at = np.column_stack([np.interp(r.times_s, track.times_s, track.poses[:, k]) for k in range(2)])
     scale, offset_m = (track.calibration.get(name, _NONE).value for name in ("range_scale", "range_offset_m"))
     return np.asarray((r.range_m - offset_m) / (1.0 + scale) - np.hypot(*(places[r.beacon] - at).T))
@@ -101,7 +101,7 @@ def next_reading(track: EstimatedPath, noise: RadioNoiseConfig) -> dict[str, Any
 
 def reviewed(run: RecordedRun, track: EstimatedPath, noise: RadioNoiseConfig) -> dict[str, Any]:
     """What ``ccatp radio slam`` says besides errors, as JSON has it."""
-    residuals = residuals_by_beacon(run, range_residuals(run, track))
+    residuals = residuals_by_beacon(run, range_residuals(run, track, noise.camera_field_rad))
     return {"residuals": residuals, "measure_next": next_reading(track, noise)}
 
 

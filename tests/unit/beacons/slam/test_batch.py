@@ -32,8 +32,8 @@ ODOMETRY = OdometryNoiseConfig(
     turn_per_sqrt_s=0.01, lateral_per_sqrt_m=0.015,
 )  # fmt: skip
 RADIO = RadioNoiseConfig(
-    range_sigma_m=0.1, range_sigma_per_m=0.02, bearing_sigma_rad=0.03, rssi_sigma_db=3.0, rssi_reference_dbm=-40.0,
-    rssi_exponent=2.2, freedom=5.0, correlation_s=0.0, gate_sigmas=5.0,
+    range_sigma_m=0.1, range_sigma_per_m=0.02, camera_field_rad=0.0, bearing_sigma_rad=0.03, rssi_sigma_db=3.0,
+    rssi_reference_dbm=-40.0, rssi_exponent=2.2, freedom=5.0, correlation_s=0.0, gate_sigmas=5.0,
 )  # fmt: skip
 NO_PRIORS = PriorsConfig(**dict.fromkeys(PriorsConfig.model_fields, 0.0) | {"pose_m": 0.05, "heading_rad": 0.03})
 PRIORS = PriorsConfig(

@@ -24,6 +24,7 @@ from ccatp.beacons.slam.measurement_models import (
 from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import BeaconId, EstimatedPath, Reading, RecordedRun, Steps
+from ccatp.beacons.slam.track_review import range_residuals
 from ccatp.config.beacon_models import FixedLagConfig
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
@@ -343,6 +344,26 @@ def test_filter_and_smoother_mean_the_same_by_a_name() -> None:
         assert track.calibration["distance_per_rad"].value == pytest.approx(0.06, abs=0.02)
         assert track.calibration["turn_scale"].value == pytest.approx(-0.08, abs=0.03)
         assert track.calibration["odometry_delay_s"].value == pytest.approx(0.0, abs=0.05)
+
+
+def test_ranges_by_height_are_depths_where_a_camera_reads_them() -> None:
+    field_rad, run = 0.6, recorded(world(3, 240.0))
+    seen = run.readings.where(np.abs(run.readings.bearing_rad) < field_rad)
+    depths_m = seen.range_m * np.cos(seen.bearing_rad) * field_rad / sin(field_rad)
+    camera = replace(run, readings=seen._replace(range_m=depths_m))
+    assert camera.readings.with_distances(field_rad).range_m == pytest.approx(seen.range_m, rel=1e-12)
+    alone = seen._replace(bearing_rad=np.full(seen.bearing_rad.size, np.nan))
+    for distances, by_rad in ((run.readings, field_rad), (alone, field_rad), (seen, 0.0)):
+        assert distances.with_distances(by_rad) is distances  # seen all around, without bearings, by no camera
+
+    noise = CONFIG.csv.radio.model_copy(update={"camera_field_rad": field_rad})
+    cfg = CONFIG.csv.model_copy(update={"radio": noise})
+    for estimator in (filter_run, smooth):
+        by_depth = estimator(camera, cfg, CONFIG.filter, no_clock)
+        by_distance = estimator(replace(run, readings=seen), CONFIG.csv, CONFIG.filter, no_clock)
+        assert by_depth.poses == pytest.approx(by_distance.poses, abs=1e-6)  # the same but for rounding
+        residuals = range_residuals(camera, by_depth, field_rad)
+        assert residuals == pytest.approx(range_residuals(camera, by_distance, field_rad), abs=1e-6)
 
 
 def test_a_twentieth_of_the_readings_refused_is_told() -> None:

@@ -18,7 +18,7 @@ from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, recorded, world
 def test_residuals_are_the_noise_of_the_ranges() -> None:
     cfg, run = load_recordings_config(), recorded(world(seconds=60.0, range_sigma_m=0.05))
     track = filter_run(run, cfg.csv, cfg.filter, perf_counter)
-    found = residuals_by_beacon(run, range_residuals(run, track))
+    found = residuals_by_beacon(run, range_residuals(run, track, 0.0))
     assert found.keys() == BEACONS.keys()
     for one in found.values():
         assert abs(one["median_m"]) < 0.05
