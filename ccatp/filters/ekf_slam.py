@@ -171,7 +171,7 @@ class EkfSlam:
         many sigmas is increased until it has the weight of one at the knee (Huber's loss, one step of reweighting). The
         NIS is that with the increased noise.
         """
-        cross = h.dot(self.covariance.take(columns, axis=0))
+        cross = h.dot(self.covariance.take(columns, 0))
         s = given = ddot(h, cross[columns]) + r
         if not (r > 0.0 and r <= s * (1.0 + 1e-9) and s < HUGE and residual * residual < HUGE):
             raise FilterDiverged(f"update is not finite: residual {residual:.6g}, noise {r:.3g}, variance {s:.3g}")

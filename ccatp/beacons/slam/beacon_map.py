@@ -1,12 +1,12 @@
 """Beacons as blocks of the filter's state, with errors that wander; how noise is learned and headings stay unknown."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp
 
 import numpy as np
 from scipy.linalg.blas import daxpy
 
-from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BeaconId
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
@@ -93,7 +93,7 @@ WANDER = "wander"  # first part of the name of a block that holds a wandering er
 class MapEntry:
     """A beacon on the map. ``way_m``, ``time_s``: of the vehicle when the wandering error was last looked at."""
 
-    columns: Columns  # pose, calibration, beacon and its wandering error, shape (k,)
+    columns: Columns  # those of all beacons, then the beacon and its wandering error, shape (k,)
     size: int
     wander: int = -1  # column of the wandering error; -1: none
     way_m: float = 0.0
@@ -104,9 +104,9 @@ class MapEntry:
 
 
 class BeaconMap(dict[BeaconId, MapEntry]):
-    """The beacons' blocks of an ``EkfSlam``."""
+    """The beacons' blocks of an ``EkfSlam``; ``shared``: columns that the readings of all of them depend on."""
 
-    def __init__(self, engine: EkfSlam, shared: slice) -> None:
+    def __init__(self, engine: EkfSlam, shared: Sequence[int]) -> None:
         super().__init__()
         self._engine, self._shared = engine, shared
 
@@ -129,11 +129,11 @@ class BeaconMap(dict[BeaconId, MapEntry]):
         """Find the columns again, after a block has gone."""
         engine = self._engine
         for beacon, entry in self.items():
-            parts: list[slice] = [slice(0, POSE), self._shared, engine.block(beacon)]
+            parts = [engine.block(beacon)]
             if (WANDER, beacon) in engine:
                 parts.append(engine.block((WANDER, beacon)))
                 entry.wander = parts[-1].start
-            entry.columns = columns_of(*parts)
+            entry.columns = columns_of(self._shared, *parts)
 
     def wander_to(self, beacon: BeaconId, model: GaussMarkovBias, way_m: float, time_s: float) -> None:
         """Bring a beacon's wandering error, in sigmas, to now: w <- phi w, variance <- phi^2 variance + 1 - phi^2."""

@@ -106,14 +106,15 @@ class BeaconSlam:
         self.engine = EkfSlam(mean, P, np.zeros(len(shared)), np.diag(np.square(shared)))
         self._shared = slice(v, v + len(shared))
         self._delay = v + len(shared) - 1 if delay_names else -1
-        self._shown = POSE + len(shared)  # of the columns of a row, those before the beacon
+        self._shown = POSE + len(shared)  # columns of a row before the beacon: pose, delay, calibration of the readings
         self.prior_sigmas = (*own, *shared)
         self._names = (*motion.names, *models.names, *delay_names)
         self._wander = None
         if correlation_s > 0.0:
             self._wander = GaussMarkovBias(how.wander_share, how.wander_length_m, correlation_s)
         self._clock = DeadReckoning(is_delayed=bool(delay_names))
-        self._map = BeaconMap(self.engine, self._shared)
+        ranges = range(v, v + self._ranges)
+        self._map = BeaconMap(self.engine, (*range(POSE), *range(ranges.stop, self._shared.stop), *ranges))
         self._transport = HeadingTransport(self.engine) if how.transports else None
         # Innovations show only what is new of an error that lasts: they teach no less noise than is set.
         least = dict.fromkeys(models.by_kind, 1.0) if correlation_s > 0.0 else {}
@@ -314,25 +315,24 @@ class BeaconSlam:
             P = engine.covariance[np.ix_(columns, columns)]
             for _ in range(self._iterations - 1):
                 Ph = P.dot(h)
-                x = prior + Ph * (residual / (float(h.dot(Ph)) + r))
+                x = prior + Ph * (residual / (float(Ph.dot(h)) + r))
                 h, residual, r, own = self._linearised(reading, entry, kind, z, x.tolist())
-                residual += float(h.dot(x - prior))
-        found = engine.update_row(columns, h, residual, r, self._gate, self._knee)
+                residual += float((x - prior).dot(h))
+        found = engine.update_row(columns, np.array(h), residual, r, self._gate, self._knee)
         if found.accepted and self._learns:
             self.levels[kind].learn(found.nis, own / found.spread)
-            self.levels["motion"].learn(found.nis, self._fresh.seen(h.item(0), h.item(1), h.item(2)) / found.spread)
+            self.levels["motion"].learn(found.nis, self._fresh.seen(*h[:POSE]) / found.spread)
         return found
 
     def _linearised(
         self, reading: Reading, entry: MapEntry, kind: str, z: float, x: list[float]
-    ) -> tuple[FloatArray, float, float, float]:
+    ) -> tuple[list[float], float, float, float]:
         """Derivatives by the columns of a beacon, residual, noise variance, and that with the wandering error."""
         is_delayed, shown = self._delay >= 0, self._shown
-        at = self._clock.at(x, reading.time_s, x[shown - 1] if is_delayed else 0.0)
-        calibration, beacon = x[POSE : POSE + self._ranges], x[shown : shown + entry.size]
+        at = self._clock.at(x, reading.time_s, x[POSE] if is_delayed else 0.0)
+        calibration, beacon = x[shown - self._ranges : shown], x[shown : shown + entry.size]
         row = self._models.by_kind[kind].row(at.pose, calibration, beacon, reading.beacon)
-        hx, hy, turned, *by_delay = at.derivatives(*row.pose, delayed=is_delayed)
-        h = [hx, hy, turned, *row.calibration, *by_delay, *row.beacon]
+        h = [*at.derivatives(*row.pose, delayed=is_delayed), *row.calibration, *row.beacon]
         expected = row.expected
         r = own = row.variance * self.levels[kind].factor
         if entry.wander >= 0:
@@ -343,13 +343,13 @@ class BeaconSlam:
             r *= 1.0 - share
             own = r + entry.fresh * by_wander * by_wander
         residual = wrap_pi(z - expected) if kind == "bearing" else z - expected
-        return np.array(h), residual, r, own
+        return h, residual, r, own
 
     def _judge(self, reading: Reading, entry: MapEntry, *, accepted: bool) -> None:
         if accepted:
-            entry.refused = 0
-            entry.on_trial = max(entry.on_trial - 1, 0)
-            self._refused = 0
+            entry.refused = self._refused = 0
+            if entry.on_trial:
+                entry.on_trial -= 1
             return
         if entry.on_trial:
             self._map.leave(reading.beacon)
