@@ -226,6 +226,14 @@ def test_removal() -> None:
     assert waits.error_m("a") < 0.3
 
 
+@pytest.mark.parametrize("correlation_s", [0.0, 3.0])
+def test_the_covariance_stays_symmetric_to_the_last_digit(correlation_s: float) -> None:
+    world = start(SETTINGS.but(radio__correlation_s=correlation_s))
+    world.drive(50)
+    P = world.slam.engine.covariance
+    np.testing.assert_array_equal(P, P.T)
+
+
 def test_errors_that_stay_while_the_vehicle_does_are_not_averaged_away() -> None:
     """A vehicle that hardly moves hears the same wrong range again and again: it believes in it none the more."""
     sigmas = []
