@@ -1,4 +1,4 @@
-"""What a fix of the puck says about the robot's position and the full state, and how well the position is known."""
+"""Fixes of the puck: the robot's position with its covariance, and the measurement model for the full state."""
 
 from math import isfinite
 from typing import NamedTuple
@@ -15,15 +15,15 @@ _WORLD_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class FixRefused(ValueError):
-    """A fix cannot be used; the pose is unchanged. The message carries the numbers."""
+    """A fix cannot be used; the pose is unchanged. The message has the numbers."""
 
 
 class FixGated(FixRefused):
-    """A fix contradicts the estimate; measured again it may prove to be right."""
+    """A fix contradicts the estimate; further measurements may confirm it."""
 
 
 class DeckFoot(NamedTuple):
-    """Where the robot's origin stood when a fix was taken, deck frame; covariance (2, 2); deviation from the height."""
+    """Place of the robot's origin at a fix, deck frame; covariance (2, 2); deviation from the height of the puck."""
 
     x_m: float
     y_m: float
@@ -32,7 +32,7 @@ class DeckFoot(NamedTuple):
 
 
 def check_fix(fix: Fix, oldest_s: float, newest_s: float) -> None:
-    """Raises ``FixRefused`` for a fix that is not finite or of a time for which the robot's path is not known."""
+    """Raises ``FixRefused`` if a fix is not finite, or its time is outside the stored path of the robot."""
     if not all(isfinite(v) for v in (fix.t_s, *fix.position_m, *fix.covariance_m2)):
         raise FixRefused(f"fix is not finite: {fix.position_m} m at {fix.t_s} s")
     if not oldest_s <= fix.t_s <= newest_s:
@@ -40,11 +40,11 @@ def check_fix(fix: Fix, oldest_s: float, newest_s: float) -> None:
 
 
 def deck_foot(mirror: Mirror, fix: Fix, puck_height_m: float) -> DeckFoot:
-    """Foot of the puck on the surface, deck frame, with its whole covariance along the surface.
+    """Foot of the puck on the surface, deck frame, with its covariance along the surface.
 
-    An error along the normal leaves the foot where it is, so the fix's covariance is projected along the normal on the
-    deck plane: ``J = [[1, 0, -nx/nz], [0, 1, -ny/nz]]``, ``J R^T C R J^T``. Raises ``FixRefused`` far from the mirror,
-    or where that is not positive definite.
+    An error along the normal does not move the foot, so the fix's covariance is projected along the normal on the deck
+    plane: ``J = [[1, 0, -nx/nz], [0, 1, -ny/nz]]``, ``J R^T C R J^T``. Raises ``FixRefused`` far from the mirror, or if
+    this is not positive definite.
     """
     try:
         x, y, deviation = mirror.foot_of_puck(fix.position_m, puck_height_m)
@@ -61,11 +61,11 @@ def deck_foot(mirror: Mirror, fix: Fix, puck_height_m: float) -> DeckFoot:
     return DeckFoot(x, y, covariance, deviation)
 
 
-_UNKNOWN_SPEEDS = 0.1**2, 0.5**2, 1.0**2  # variances of v, a, w of a robot of which nothing is known
+_UNKNOWN_SPEEDS = 0.1**2, 0.5**2, 1.0**2  # variances of v, a, w when they are not known
 
 
 def fix_row(z: FloatArray, mean: FloatArray, slope: Slope, late_s: float) -> tuple[FloatArray, FloatArray]:
-    """Residual (2,) and row (2, n) of a deck position ``z`` (2,), m, by a state ``late_s`` later; V and W constant."""
+    """Residual (2,) and H (2, n) of a deck position ``z`` (2,), m, for a state ``late_s`` later; V and W constant."""
     H = np.zeros((2, STATES))
     H[0, X] = H[1, Y] = H[0, TX] = H[1, TY] = 1.0
     residual = z - mean[:2] - mean[TILT]
@@ -90,10 +90,10 @@ def relocated(
     *,
     is_lost: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (n,) and covariance (n, n) of a state whose position was wrong; wheel angles count from here.
+    """Mean (n,) and covariance (n, n) after the correction of a wrong position; the wheel angles begin at zero.
 
-    The heading loses its certainty, not its value. ``residual`` (2,) and ``variance`` (2, 2), m^2, are of the position;
-    ``tilt_variance_m2`` is what the panel's tilt does to the puck's place; ``is_lost``: speeds are not known either.
+    The heading keeps its value, with a larger variance. ``residual`` (2,) and ``variance`` (2, 2), m^2: of the
+    position; ``tilt_variance_m2``: of the puck's place by the panel's tilt; ``is_lost``: reset the speeds, too.
     """
     x, P = mean.copy(), covariance.copy()
     heading_rad2 = float(P[PSI, PSI]) + heading_variance_rad2

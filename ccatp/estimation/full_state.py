@@ -1,4 +1,4 @@
-"""The full-state localizer: pose, speeds and the sensors' own errors in one filter, on the curved surface."""
+"""The full-state localizer: pose, speeds and sensor errors in one filter, on the curved surface."""
 
 from math import atan2, cos, hypot, inf, sin, sqrt
 
@@ -27,20 +27,20 @@ from ccatp.filters.base import FilterDiverged, Innovation
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
 
-_CHUNK = 100  # samples at rest after which their mean is used, however long the rest
-_CONSISTENT = 3  # this many refused fixes that agree with each other are right, and the pose is wrong
+_CHUNK = 100  # number of samples at rest after which their mean is used
+_CONSISTENT = 3  # if this many refused fixes agree with each other, the pose is wrong
 _ROUNDING_S = 1e-6
 _NOMINAL_FRAME_S = 0.01
-_SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # of a heading, from where a leg ended instead
+_SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # for the error of the heading, from the end of a leg
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
 
 
 class FullStateLocalizer(LocalizerBase):
     """Estimates pose, speeds, sensor errors, slip and creep with one filter, deck frame; see docs/localization.md.
 
-    Frames are gathered into blocks, which the filter takes in one step; dead reckoning carries the pose from frame to
-    frame. ``pose`` is in the frame of the panel under the robot, ``creep`` the downhill drift per metre of travel in
-    its plane; ``position_sigma_m`` is along the worst direction, at the last step of the filter.
+    Frames are collected into blocks, and the filter makes one step per block. Between steps the pose advances by dead
+    reckoning. ``pose``: in the frame of the panel under the robot; ``creep``: downhill drift per metre of travel in its
+    plane; ``position_sigma_m``: in the worst direction, at the last step of the filter.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, start: PanelPose, wrap: FilterWrap = unwrapped) -> None:
@@ -59,14 +59,14 @@ class FullStateLocalizer(LocalizerBase):
         self._running = PosePredictor(robot.wheel_radius_m, robot.wheel_base_m, self._full.jerk_density_m2_s5)
         self._panel = mirror.panel(start.panel)
         self._refused: list[FloatArray] = []
-        self._fixed_m: FloatArray | None = None  # where the last fix that counted was
-        self._is_relocated = False  # no fix has agreed since it began again
+        self._fixed_m: FloatArray | None = None  # position of the last fix that was used
+        self._is_relocated = False  # no fix has agreed since the last relocation
         self._creep_on: Panel | None = None
         self._is_new_base, self._half_s, self._frame_s = False, 0.0, _NOMINAL_FRAME_S
         self._predict_pose(0.0)
         self._locate()
 
-    # -- what it knows ------------------------------------------------------------------------------------------------
+    # -- the estimate -------------------------------------------------------------------------------------------------
 
     @property
     def deck_pose(self) -> DeckPose:
@@ -91,11 +91,11 @@ class FullStateLocalizer(LocalizerBase):
 
     @property
     def is_resting(self) -> bool:
-        """The wheels have stood long enough to be sure."""
+        """The wheels have stood long enough to be sure that the robot is at rest."""
         return self._rest.is_resting
 
     def rest(self) -> None:
-        """The mission takes the robot to be at rest; the wheels themselves say here when it really is."""
+        """No effect: this localizer detects rest from the wheels."""
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
@@ -105,7 +105,7 @@ class FullStateLocalizer(LocalizerBase):
         right_rad, left_rad = self._right.add(*right, dt_s), self._left.add(*left, dt_s)
         if self._is_new_base:
             self._is_new_base = False
-            # What the wheels did in the frame that begins a new time base lies in the gap before it, for the filter.
+            # For the filter, the motion in the frame that begins a new time base belongs to the gap before it.
             self._right.angle_rad -= right_rad
             self._left.angle_rad -= left_rad
             right_rad = left_rad = 0.0
@@ -118,7 +118,7 @@ class FullStateLocalizer(LocalizerBase):
             if is_still:
                 self._right.rest(right[1])
                 self._left.rest(left[1])
-                self._rebase()  # what adds up meanwhile is noise
+                self._rebase()  # at rest the sums contain only noise
                 self._rested_s += dt_s
                 self._block.stand(imu)
                 rest.add(imu, gravity)
@@ -138,7 +138,7 @@ class FullStateLocalizer(LocalizerBase):
         block.add(dt_s, imu, is_turning=bool(right_rad or left_rad))
         self._running.advance(dt_s, right_rad, left_rad, imu[-1][2] if imu else None)
         transitions = self._edges.scan(edges)
-        # Wheels that say nothing do not stand for that reason.
+        # Wheels without samples do not count as standing.
         is_stop = is_still and self._right.is_fresh and self._left.is_fresh and rest.stood(dt_s)
         if transitions or is_stop or block.dt_s >= self._update_period_s:
             self._take_block(self.t_s)
@@ -164,7 +164,7 @@ class FullStateLocalizer(LocalizerBase):
         self._check_speeds(float(mean[V]), float(mean[W]))
 
     def _locate(self) -> None:
-        """Take over where dead reckoning has led."""
+        """Update pose, speeds and creep from dead reckoning."""
         now, slope, at = self._running, self._slope, self._panel
         x, y, psi = now.x_m, now.y_m, now.heading_rad
         if abs(x - at.x_m) > _NEAR_BORDER * at.half_x_m or abs(y - at.y_m) > _NEAR_BORDER * at.half_y_m:
@@ -183,7 +183,7 @@ class FullStateLocalizer(LocalizerBase):
         heading = atan2(bx * hx + by * hy + bz * hz, ax * hx + ay * hy + az * hz)
         self.pose = PanelPose(at.id, ax * dx + ay * dy + az * dz, bx * dx + by * dy + bz * dz, heading)
         self.speed_m_s, self.rate_rad_s = now.v_m_s, now.omega_rad_s
-        if at is not self._creep_on:  # or the filter has taken a step
+        if at is not self._creep_on:  # another panel, or the filter has made a step
             self._creep_on = at
             x, y = now.creep_x, now.creep_y
             self.creep = at.rotate_from_deck((x, y, fx * x + fy * y))[:2]
@@ -204,7 +204,7 @@ class FullStateLocalizer(LocalizerBase):
             self._running.stand()
             return
         frame_s = self._frame_s
-        # The bounded errors at both ends of a frame, and what the noise of the rates adds up to in between.
+        # The bounded errors at both ends of a frame, and the sum of the rates' noise in between.
         angle = 2.0 * self._right.variance_rad2() + self._estimate.encoder_walk(self._right) * frame_s
         self._running.trust(angle, self._gyro.variance, frame_s)
 
@@ -220,8 +220,8 @@ class FullStateLocalizer(LocalizerBase):
     def fuse_fix(self, fix: Fix) -> float:
         """Fuse a position of the puck at the time it was taken; returns how far the pose jumped, m.
 
-        Raises ``FixGated``: it contradicts the estimate, and not often enough yet to be used all the same;
-        ``FixRefused``: not finite, too old, from the future, or far from the mirror. The pose is unchanged by both.
+        Raises ``FixGated``: it contradicts the estimate, and too few others agree with it yet; ``FixRefused``: not
+        finite, too old, from the future, or far from the mirror. Both leave the pose unchanged.
         """
         foot = self._foot_of(fix, self._estimate.journal.oldest_s)
         z, variance = np.array([foot.x_m, foot.y_m]), foot.covariance_m2
@@ -241,7 +241,7 @@ class FullStateLocalizer(LocalizerBase):
         return sqrt((now.x_m - before[0]) ** 2 + (now.y_m - before[1]) ** 2)
 
     def _condition(self, t_s: float, z: FloatArray, variance: FloatArray) -> None:
-        """Update with a position (2,) of time ``t_s`` and its covariance (2, 2), if it does not contradict."""
+        """Update with a position (2,) at ``t_s`` and its covariance (2, 2), unless it contradicts the estimate."""
         if self._block.dt_s > 0.0:
             self._take_block(self.t_s)
         residual, expected = self._estimate.expect(t_s, z)
@@ -255,7 +255,7 @@ class FullStateLocalizer(LocalizerBase):
     def _relocate(self, z: FloatArray, residual: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
         turn_rad = 0.0
         if self._fixed_m is not None:
-            # How wrong the heading has been, if that alone led the robot to ``z`` on the leg since the last fix.
+            # Heading error that alone would have led the robot to ``z`` on the leg since the last fix.
             leg_m, off_m = hypot(*(z - residual - self._fixed_m)), hypot(*residual)
             if leg_m > _SHORTEST_LEG_M:
                 turn_rad = min(_LARGEST_DOUBT_RAD, off_m / leg_m)
@@ -266,7 +266,7 @@ class FullStateLocalizer(LocalizerBase):
         self._rebase()
 
     def _refuse(self, z: FloatArray, residual: FloatArray, variance: FloatArray) -> None:
-        """Lock-out recovery: an estimate that is sure of itself and wrong would refuse every true fix from now on."""
+        """Refuse a fix, or relocate if enough of them agree: a wrong, overconfident estimate would refuse all fixes."""
         refused = [r for r in self._refused if sqrt(float(np.sum((r - residual) ** 2))) <= self._full.consistent_m]
         self._refused = [*refused, residual]
         distance_mm = 1e3 * sqrt(float(residual.dot(residual)))
@@ -281,10 +281,10 @@ class FullStateLocalizer(LocalizerBase):
         )
 
     def inflate_covariance(self, way_m: float, turn_rad: float) -> None:
-        """The pose may be wrong by this much, because what it was made of was: the pose stays, its certainty goes."""
+        """Inflate the covariance of the pose by these standard deviations, because its inputs may have been wrong."""
         if self.is_frozen:
             return
-        # What the wheels may have done while no samples were received is part of the doubt.
+        # The motion during a gap of the encoders is covered by the inflation.
         self._right.restart()
         self._left.restart()
         if self._block.dt_s > 0.0:
@@ -305,7 +305,7 @@ class FullStateLocalizer(LocalizerBase):
         if last_s > -inf and not self.is_frozen:
             if self._block.dt_s > 0.0:
                 self._take_block(last_s)
-            # A gap without frames, if it is one and no jump of the clock, ends with the robot's own time-to-live.
+            # If this is a gap and not a jump of the clock, the robot's time-to-live has limited its motion.
             lost_s = min(max(t_s - last_s, MAX_FRAME_STEP_S), LONGEST_GAP_S)
             self._estimate.inflate_covariance(self._running.v_m_s * lost_s, self._running.omega_rad_s * lost_s)
             self._predict_pose(0.0)

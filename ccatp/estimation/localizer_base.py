@@ -1,4 +1,4 @@
-"""What every localizer does with a frame: order of time, which samples are used, edges, divergence."""
+"""The common part of the localizers: order of frames, validation of samples, edge transitions, divergence."""
 
 from abc import ABC, abstractmethod
 from collections import Counter, deque
@@ -32,17 +32,17 @@ WheelReadings = tuple[Sequence[float], Sequence[float]]
 HEADING = 2
 """Index of the heading in the states of both localizers."""
 MAX_FRAME_STEP_S = 0.1
-"""A frame further than this from the last one is a jump of the robot's clock or a gap in the link."""
+"""A longer time between two frames is a jump of the robot's clock or a gap in the link."""
 LONGEST_GAP_S = 0.4
-"""After so long without a drive the robot stands whatever the last one was: its time-to-live and the run-down."""
+"""After this time without a drive the robot stands: time-to-live of the last drive, and run-down of the wheels."""
 BACKWARD_LIMIT = 5
-"""This many backward time stamps in a row ask for a hold."""
+"""Number of backward time stamps in a row that requests a hold."""
 _ROUNDING_S = 1e-6
-_READABLE = 1e9  # rad/s or m/s^2: far beyond what any sensor shows; squares and products of it stay finite
+_READABLE = 1e9  # rad/s or m/s^2: far beyond every sensor's range; its squares and products stay finite
 
 
 class SampleSource:
-    """The time stamps of one sensor: each is used once, in increasing order."""
+    """The time stamps of one sensor. Each is used once, in increasing order."""
 
     def __init__(self, name: str) -> None:
         self.name, self.newest_s, self.backward_run = name, -inf, 0
@@ -50,7 +50,7 @@ class SampleSource:
 
 
 def use_samples(times_s: Sequence[float], oldest_s: float, *sources: SampleSource) -> None:
-    """Samples of these times, newer than any before and increasing, are used; older ones are forgotten."""
+    """Record these time stamps, newer than all before and increasing, as used; drop those before ``oldest_s``."""
     newest_s = times_s[-1]
     for source in sources:
         source.newest_s, source.backward_run = newest_s, 0
@@ -61,9 +61,9 @@ def use_samples(times_s: Sequence[float], oldest_s: float, *sources: SampleSourc
 
 
 class SampleValidator:
-    """Picks the usable IMU and encoder samples of a frame and counts the others by reason in ``counts``.
+    """Selects the usable IMU and encoder samples of a frame, and counts the others by reason in ``counts``.
 
-    ``backward_source`` names a sensor that has sent ``BACKWARD_LIMIT`` backward time stamps in a row, until emptied.
+    ``backward_source``: a sensor that sent ``BACKWARD_LIMIT`` backward time stamps in a row; cleared by its reader.
     """
 
     def __init__(self, history_s: float, largest_rate_rad_s: float, counts: dict[str, int]) -> None:
@@ -73,7 +73,7 @@ class SampleValidator:
         self.restart()
 
     def restart(self) -> None:
-        """Forget every time stamp: the robot's clock has jumped."""
+        """Drop all time stamps, because the robot's clock has jumped."""
         self._imu = SampleSource("imu")
         self._right, self._left = SampleSource("right encoder"), SampleSource("left encoder")
 
@@ -91,7 +91,7 @@ class SampleValidator:
             and all(map(lt, times, times[1:]))
             and None not in right
             and None not in left
-            # No less than each rate; not true of what is not a number.
+            # hypot is at least each absolute rate; the comparison is false for NaN.
             and hypot(*right) <= largest >= hypot(*left)
         ):
             use_samples(times, oldest_s, self._right, self._left)
@@ -99,7 +99,7 @@ class SampleValidator:
         return self._judged_wheels(frame_s, encoders)
 
     def _judged_wheels(self, frame_s: float, encoders: Sequence[WheelSample]) -> tuple[WheelReadings, WheelReadings]:
-        """Each sample judged by itself."""
+        """Judge each sample by itself."""
         right: tuple[list[float], list[float]] = [], []
         left: tuple[list[float], list[float]] = [], []
         largest = self._largest_rad_s
@@ -155,10 +155,7 @@ class SampleValidator:
 
 
 class SensorTransition(NamedTuple):
-    """One edge sensor changed its value, between two samples whose middle is ``t_s``.
-
-    ``corner`` as in ``core.Corner``.
-    """
+    """A change of an edge sensor's value between two samples; ``t_s``: their middle; ``corner``: as ``core.Corner``."""
 
     t_s: float
     interval_s: float
@@ -167,13 +164,13 @@ class SensorTransition(NamedTuple):
 
 
 class EdgeScanner:
-    """Finds the transitions in the stream of edge samples. Samples that are not newer than the last are skipped."""
+    """Finds the transitions in the stream of edge samples. Samples not newer than the last one are skipped."""
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the last sample: the robot's clock has jumped."""
+        """Drop the last sample, because the robot's clock has jumped."""
         self._t_s = -inf
         self._values: tuple[int, ...] = ()
 
@@ -196,7 +193,7 @@ class EdgeScanner:
 
 
 FilterWrap = Callable[[Filter], Filter]
-"""Makes a filter of a filter, which it may record or replace."""
+"""Returns a filter that wraps the given one, to record or replace it."""
 
 
 def unwrapped(filter_: Filter) -> Filter:
@@ -204,24 +201,24 @@ def unwrapped(filter_: Filter) -> Filter:
     return filter_
 
 
-_IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is no estimate
+_IMPOSSIBLE = 2.0  # multiple of the wheels' largest speed beyond which an estimate has diverged
 
 
 class LocalizerBase(ABC):
-    """Admits frames in order of time, and asks to hold when time or the filter go wrong.
+    """Admits frames in order of time, and requests a hold if time stamps or the filter are wrong.
 
-    ``wrap`` is put around the filter of ``run.filter``. ``t_s``: robot time to which the pose belongs, that of the last
-    frame used; -inf before the first. ``hold_cause``, why the mission should hold, stays until ``clear_hold``;
-    ``is_frozen``: the filter has diverged, and the pose stands still until the next fix; ``notices`` for the operator
-    are removed by their reader. Samples older than ``localizer.history_s`` are refused, and so are inertial samples
-    that contradict the wheels and rates that no wheel turns at.
+    ``wrap`` wraps the filter of ``run.filter``. ``t_s``: robot time of the pose, that of the last frame used; -inf
+    before the first. ``hold_cause``: why the mission should hold, until ``clear_hold``. ``is_frozen``: the filter has
+    diverged, and the pose is constant until the next fix. ``notices``: for the operator, cleared by their reader.
+    Refused are samples older than ``localizer.history_s``, inertial samples that contradict the wheels, and impossible
+    wheel rates.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, states: int, wrap: FilterWrap) -> None:
         self.t_s, self.hold_cause, self.is_frozen = -inf, "", False
         self.counts: dict[str, int] = Counter()
         self.notices: list[str] = []
-        # Whoever derives re-initialises the filter at once; what counts is its size.
+        # Subclasses re-initialise the filter at once; only its size matters here.
         self._filter = wrap(FILTERS[cfg.run.filter](np.zeros(states), np.eye(states)))
         self._mirror = mirror
         self._puck_height_m = cfg.robot.puck_height_m
@@ -238,15 +235,15 @@ class LocalizerBase(ABC):
         return sqrt(max(float(self._filter.covariance[HEADING, HEADING]), 0.0))
 
     def clear_hold(self) -> None:
-        """Forget the cause for a hold; one that persists comes back."""
+        """Clear the cause for a hold; a cause that persists is set again."""
         self.hold_cause = ""
 
     def step(
         self, t_s: float, imu: ImuReadings, encoders: Sequence[WheelSample], edges: Edges, gravity: Gravity = None
     ) -> None:
-        """Take one sensors frame of robot time ``t_s``: any number of samples of each kind, oldest first.
+        """Take one sensors frame at robot time ``t_s``: any number of samples of each kind, oldest first.
 
-        Unusable ones are dropped and counted; a frame that is not newer than the last one changes nothing.
+        Unusable samples are dropped and counted. A frame that is not newer than the last one has no effect.
         """
         last_s = self.t_s
         dt_s = t_s - last_s
@@ -278,9 +275,9 @@ class LocalizerBase(ABC):
             self._freeze(error)
 
     def _is_new_time_base(self, t_s: float) -> bool:
-        """Whether a frame that does not continue the last one is used all the same; if not, it is counted.
+        """Whether a frame that does not continue the last one begins a new time base; otherwise it is counted.
 
-        A single frame from elsewhere changes nothing; the second one that continues it shows that the clock has jumped.
+        A single frame with another time has no effect. A second frame that continues it shows that the clock jumped.
         """
         if not isfinite(t_s) or -MAX_FRAME_STEP_S <= t_s - self.t_s <= 0.0:
             self._stale_run += 1
@@ -299,7 +296,7 @@ class LocalizerBase(ABC):
             raise FilterDiverged(f"{v_m_s:.3g} m/s and {omega_rad_s:.3g} rad/s are more than the wheels can do")
 
     def _foot_of(self, fix: Fix, oldest_s: float) -> DeckFoot:
-        """Raises ``FixRefused``: not finite, older than ``oldest_s``, from the future, or far from the mirror."""
+        """Foot of a fix; ``FixRefused``: not finite, older than ``oldest_s``, in the future, or far from the mirror."""
         check_fix(fix, oldest_s, self.t_s + MAX_FRAME_STEP_S)
         return deck_foot(self._mirror, fix, self._puck_height_m)
 
@@ -313,10 +310,10 @@ class LocalizerBase(ABC):
 
     @abstractmethod
     def _resync(self, t_s: float, last_s: float) -> None:
-        """Begin a time base at ``t_s``, after ``last_s`` of the old one (-inf: none); the pose does not step."""
+        """Begin a time base at ``t_s``, after ``last_s`` of the old one (-inf: none). The pose does not change."""
 
     @abstractmethod
     def _use(
         self, dt_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings, edges: Edges, gravity: Gravity
     ) -> None:
-        """Bring a filter, if not frozen, to ``t_s``, ``dt_s`` after the last frame (0 in a new base); may diverge."""
+        """Advance the filter, unless frozen, by ``dt_s`` (0 in a new time base); may raise ``FilterDiverged``."""

@@ -1,4 +1,4 @@
-"""Dead reckoning: the ground, the arc of one step, the path driven lately, the pose between filter steps."""
+"""Dead reckoning: slope of the ground, arc of a step, recent path, pose between filter steps, wheel angles."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -9,9 +9,9 @@ from typing import NamedTuple
 from ccatp.core import FloatArray, ImuSample
 from ccatp.mirror.mirror import Mirror
 
-# Third derivatives of these mirrors stay below 3e-3 1/m^2: within this distance a slope is off by less than 1e-7.
+# Third derivatives of these mirrors stay below 3e-3 1/m^2, so within this distance a slope is off by less than 1e-7.
 _REACH_M = 5e-3
-# A tangent plane flatter than this has no downhill direction worth the name.
+# Below this slope no downhill direction is defined.
 _LEVEL = 1e-3
 
 
@@ -28,7 +28,7 @@ class Slope(NamedTuple):
 
 
 class Terrain:
-    """Slopes where the robot is, at a fraction of the cost of the polynomial."""
+    """Slopes near the robot, at a fraction of the cost of the polynomial."""
 
     def __init__(self, mirror: Mirror) -> None:
         self._surface = mirror.surface
@@ -57,7 +57,7 @@ class Terrain:
         self._x_m, self._y_m = x_m, y_m
         gx, gy, gz = self._gravity
         norm = 1.0 + fx * fx + fy * fy
-        # n = (-fx, -fy, 1)/W; what is left of g without its part along n.
+        # g minus its component along n = (-fx, -fy, 1)/W.
         along = (gz - fx * gx - fy * gy) / norm
         tx, ty, tz = gx + along * fx, gy + along * fy, gz - along
         length = sqrt(tx * tx + ty * ty + tz * tz)
@@ -92,16 +92,16 @@ class OdometryPose(NamedTuple):
 def arc_step(v_m_s: float, heading_rad: float, turn_rad: float, dt_s: float) -> tuple[float, float]:
     """Chord (dx, dy), m, of an arc from ``heading_rad`` on: v dt sinc(turn/2) at heading + turn/2.
 
-    Thesis eq. 2.14 as it was meant; printed it has the time step inside the cosine and none on the speed.
+    Thesis eq. 2.14, corrected: the printed form has the time step inside the cosine and not on the speed.
     """
     half = 0.5 * turn_rad
-    # Below _SMALL_RAD the series 1 - half^2/6 is exact to the last digit, and 0/0 is avoided.
+    # Below _SMALL_RAD the series 1 - half^2/6 is exact to the last digit, and avoids 0/0.
     chord = v_m_s * dt_s * (sin(half) / half if abs(half) > _SMALL_RAD else 1.0 - half * half / 6.0)
     return chord * cos(heading_rad + half), chord * sin(heading_rad + half)
 
 
 class Odometer:
-    """The path of the last ``history_s``, and the whole of the standstill before it, in a frame that nothing moves."""
+    """The path of the last ``history_s`` and the whole standstill before it, in a frame that fixes do not move."""
 
     def __init__(self, history_s: float) -> None:
         self._history_s = history_s
@@ -109,7 +109,7 @@ class Odometer:
         self.place = OdometryPose(0.0, 0.0, 0.0)
 
     def start(self, t_s: float) -> None:
-        """Begin at ``t_s``; a second call moves the time base and keeps the path."""
+        """Begin at ``t_s``; a second call shifts the time base and keeps the path."""
         if not self._path:
             self._path.append((t_s, self.place))
             return
@@ -117,7 +117,7 @@ class Odometer:
         self._path = deque((t + shift, place) for t, place in self._path)
 
     def advance(self, t_s: float, v_m_s: float, turn_rad: float, dt_s: float) -> None:
-        """Drive one step that ends at ``t_s``: mean speed m/s, turn rad, duration s."""
+        """Add a step that ends at ``t_s``: mean speed, turn, duration."""
         here = self.place
         dx, dy = arc_step(v_m_s, here.heading_rad, turn_rad, dt_s)
         self.place = OdometryPose(here.x_m + dx, here.y_m + dy, here.heading_rad + turn_rad)
@@ -134,11 +134,11 @@ class Odometer:
 
     @property
     def oldest_s(self) -> float:
-        """The earliest time that ``at`` knows."""
+        """The earliest time in the path."""
         return self._path[0][0] if self._path else float("inf")
 
     def at(self, t_s: float) -> OdometryPose:
-        """Place at ``t_s``, linear between steps; outside the kept path its nearest end."""
+        """Place at ``t_s``, linear between steps; outside the stored path its nearest end."""
         later = None
         for entry in reversed(self._path):
             if entry[0] <= t_s:
@@ -151,10 +151,10 @@ class Odometer:
 
 
 class PosePredictor:
-    """Deck pose and speeds now: the filter's state at its last step, and ``SurveyMotion`` by dead reckoning since.
+    """Current deck pose and speeds: the filter's last step, advanced by dead reckoning with ``SurveyMotion``.
 
-    The speeds come from an observer of fixed gain: the filter's acceleration carries the speed on, the wheels' travel
-    corrects it by as much as their resolution is worth; the rate is the mean of wheels and gyroscope by their noise.
+    The speed comes from an observer of fixed gain: it is predicted with the filter's acceleration and corrected with
+    the wheels' travel, by its resolution. The rate is the mean of wheels and gyroscope, weighted by their noise.
     """
 
     def __init__(self, wheel_radius_m: float, wheel_base_m: float, jerk_density_m2_s5: float) -> None:
@@ -166,7 +166,7 @@ class PosePredictor:
         self.creep_x = self.creep_y = self._turn_creep_x = self._turn_creep_y = 0.0
 
     def begin(self, mean: FloatArray, slope: Slope, half_s: float, turn_creep_share: float = 1.0) -> None:
-        """The filter has taken a step of which ``half_s`` is half the length; its mean speed belongs to the middle."""
+        """Begin after a step of the filter of length 2 ``half_s``, whose mean speed belongs to the middle."""
         state: list[float] = mean.tolist()
         x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c, *_, ct = state  # as ``state_model``
         self.x_m, self.y_m, self.heading_rad = x, y, psi
@@ -186,7 +186,7 @@ class PosePredictor:
         self._turn_creep_x, self._turn_creep_y = ct * gx, ct * gy
 
     def trust(self, angle_variance_rad2: float, rate_variance_rad2_s2: float, dt_s: float) -> None:
-        """Noise of one wheel's travel in a frame of ``dt_s``, and of a sample of the gyroscope."""
+        """Set the noise of one wheel's travel in a frame of ``dt_s``, and of a gyroscope sample."""
         noise = angle_variance_rad2, rate_variance_rad2_s2, dt_s
         if noise == self._noise:
             return
@@ -200,11 +200,11 @@ class PosePredictor:
         self._gyro_share = turning / (turning + rate_variance_rad2_s2)
 
     def stand(self) -> None:
-        """The robot is at rest."""
+        """Set all speeds to zero: the robot is at rest."""
         self.v_m_s = self.omega_rad_s = self._a = 0.0
 
     def advance(self, dt_s: float, right_rad: float, left_rad: float, rate_rad_s: float | None) -> None:
-        """A frame of ``dt_s`` in which the wheels turned so far; the gyroscope's last sample, where there is one."""
+        """Advance by a frame of ``dt_s``: turns of the wheels, and the last gyroscope sample or None."""
         right, left = right_rad * self._right_m, left_rad * self._left_m
         d, turn = 0.5 * (right + left), (right - left) * self._per_base
         middle = self.heading_rad + 0.5 * turn
@@ -224,7 +224,7 @@ class PosePredictor:
 
 
 class PreintegratedMotion(NamedTuple):
-    """Of consecutive frames: mean angular rate, and mean acceleration from the middle of the block before."""
+    """Mean angular rate of a block of frames, and mean acceleration from the middle of the block before."""
 
     dt_s: float
     turning_s: float
@@ -234,11 +234,11 @@ class PreintegratedMotion(NamedTuple):
 
 
 class Preintegrator:
-    """Gathers frames into blocks, in which the path is an arc.
+    """Collects frames into blocks, in which the path is an arc.
 
-    The mean rate is that of the samples by the trapezoid rule, the difference of two mean speeds the mean acceleration
-    from middle to middle. Frames without a sample lengthen the trapezoid to the next one: the unit may be slower than
-    the frames.
+    The mean rate follows from the samples by the trapezoidal rule, and the mean acceleration is that from the middle of
+    one block to the middle of the next. A frame without a sample lengthens the trapezoid to the next sample, because
+    the inertial unit may be slower than the frames.
     """
 
     def __init__(self) -> None:
@@ -252,18 +252,18 @@ class Preintegrator:
         self._samples = self._frames = 0
 
     def restart(self) -> None:
-        """The robot's clock has jumped, or it has been at rest: nothing reaches across."""
+        """Drop all samples, because the robot's clock has jumped, or the pose was set anew."""
         self._last = self._before = None
         self._missed = 0
         self._clear()
 
     def stand(self, imu: Sequence[ImuSample]) -> None:
-        """A frame at rest: its sample is where the trapezoid of the first moving frame begins."""
+        """Take a frame at rest; its sample begins the trapezoid of the first moving frame."""
         self._last = (imu[-1][1], imu[-1][2]) if imu else None
         self._before, self._missed = None, 0
 
     def add(self, dt_s: float, imu: Sequence[ImuSample], *, is_turning: bool) -> None:
-        """Take a frame of length ``dt_s``; of the inertial unit its last sample."""
+        """Take a frame of length ``dt_s`` with the last of its inertial samples."""
         self.dt_s += dt_s
         if is_turning:
             self._turning_s += dt_s
@@ -282,7 +282,7 @@ class Preintegrator:
         self._last = (ax, wz)
 
     def take(self) -> PreintegratedMotion:
-        """The block so far; gathering begins again."""
+        """The block so far; the next one begins."""
         n = self._frames
         rate = acceleration = None
         if n:
@@ -295,31 +295,30 @@ class Preintegrator:
         return block
 
 
-# Frames without a sample of the inertial unit over which a trapezoid still reaches: 20 Hz and frames of 100 Hz.
+# Largest number of frames without an inertial sample in a trapezoid: samples at 20 Hz, frames at 100 Hz.
 _MOST_MISSED = 4
-# Nothing but a counter gives exact zeros: this many samples in a row without another value.
+# Number of exact zeros in a row that shows a counting encoder; an analogue one never gives exact zeros.
 _ZEROS_OF_A_COUNTER = 8
 _COUNTER_NOISE = 1.0 / 12.0  # variance of a uniform distribution over one count
-_MIN_VARIANCE_RAD2 = 1e-10  # a third of a micrometre of travel: less would cost the filter digits for nothing
-# A wheel that gave no sample for this long may have done anything meanwhile.
+_MIN_VARIANCE_RAD2 = 1e-10  # a third of a micrometre of travel; less would only cost the filter digits
+# After this time without a sample the wheel's motion in between is uncertain.
 _GAP_S = 0.02
-# A sample this shortly before the end of its frame is taken at its end.
+# A sample at most this long before the end of its frame counts as taken at its end.
 _SAME_S = 1e-4
 _WHEEL_ACCELERATION_RAD_S2 = 10.0  # limits.a_max_m_s2 and alpha_max_rad_s2 together, on wheels of 30 mm
-# So long a wheel without samples is taken to turn as it did lately.
+# For this time a wheel without samples is assumed to keep its recent rate.
 _BRIDGED_S = 0.1
-_LOST = 1.5  # periods between two samples of a counter beyond which one is missing
+_LOST = 1.5  # number of periods between two samples of a counter beyond which a sample is missing
 _LATELY_S = 0.05
-_EVEN = 0.05  # of a period: what a frame's periods may be longer than the shortest, all together
-_ENOUGH = 200  # frames, or with a counter counts, after which the period and a count are known
+_EVEN = 0.05  # part of a period by which the periods of a frame may exceed the shortest one, in sum
+_ENOUGH = 200  # number of frames, or of counts of a counter, after which period and count are known
 
 
 class WheelAngle:
     """The angle of one wheel since ``rebase``, the sum of its rate samples.
 
-    Of a counting encoder the sum of rate times period is exact to a count; the noisy rate of an analogue one is summed
-    by the trapezoid rule. At rest only a counter gives nothing but zeros. ``noise_rad2_s2``: variance of a sample at
-    rest, None until it was seen.
+    For a counting encoder the sum of rate times period is exact to one count. The noisy rate of an analogue encoder is
+    integrated by the trapezoidal rule. ``noise_rad2_s2``: variance of a sample at rest, None before the first rest.
     """
 
     def __init__(self) -> None:
@@ -331,18 +330,18 @@ class WheelAngle:
         self.noise_rad2_s2: float | None = None
 
     def restart(self) -> None:
-        """The robot's clock has jumped: the next sample begins a new sum."""
+        """Begin again with the next sample, because the robot's clock has jumped."""
         self._t_s = -inf
         self._bridged_s = self._bridged_rad = 0.0
 
     def rebase(self) -> None:
-        """Count from here."""
+        """Set the angle to zero."""
         self.angle_rad = 0.0
 
     def add(self, times_s: Sequence[float], rates_rad_s: Sequence[float], dt_s: float = 0.0) -> float:
-        """Add the samples of a frame of ``dt_s``, oldest first; returns by how much the wheel has turned, rad.
+        """Add the samples of a frame of ``dt_s``, oldest first; returns the turn of the wheel, rad.
 
-        Without samples that is what it did lately, for a while: the pose would jump by it when samples come again.
+        Without samples it assumes the recent rate for a while, so that the pose does not jump when samples come again.
         """
         self.is_fresh = bool(times_s)
         if not times_s:
@@ -357,7 +356,7 @@ class WheelAngle:
                 self._zeros = 0
         elapsed_s = times_s[-1] - self._t_s
         if self._seen >= _ENOUGH and elapsed_s < (len(times_s) + _EVEN) * self._period_s:
-            # None is missing, and the periods are as even as the clock: their sum says it all.
+            # No sample is missing and the periods are equal, so the sum of the rates is enough.
             total = sum(rates_rad_s)
             turned = elapsed_s / len(times_s) * (total if is_counter else total + 0.5 * (self._rate - rates_rad_s[-1]))
         else:
@@ -399,7 +398,7 @@ class WheelAngle:
         for t, rate in zip(times_s, rates_rad_s, strict=True):
             dt = t - t0
             if dt > _LOST * period:
-                # A rate holds for its own period only; what the wheel did before it is taken from what it did lately.
+                # A rate is valid only for its own period; before that the recent mean rate is assumed.
                 lost_s = dt - period
                 turned += self._mean_rate * lost_s
                 self._gap_rad += abs(self._mean_rate) * lost_s + (least if least < inf else 0.0)
@@ -425,28 +424,28 @@ class WheelAngle:
         return self.is_counter
 
     def take_gap(self) -> float:
-        """What may be wrong with the angle for want of samples, rad; reset by the call."""
+        """Possible error of the angle by missing samples, rad; reset by the call."""
         gap_rad, self._gap_rad = self._gap_rad, 0.0
         return gap_rad
 
     def angle_at(self, t_s: float) -> tuple[float, float]:
-        """The angle at the end of a frame, rad, and what its variance grows by where the last sample is older."""
+        """The angle at the end of a frame, rad, and the additional variance if the last sample is older."""
         lag_s = t_s - self._t_s
         if not self.is_fresh or not _SAME_S < lag_s < _BRIDGED_S:
             return self.angle_rad, 0.0
         return self.angle_rad + self._rate * lag_s, (_WHEEL_ACCELERATION_RAD_S2 * lag_s * lag_s) ** 2
 
     def rest(self, rates_rad_s: Sequence[float]) -> None:
-        """Learn from the samples of a wheel that stands."""
+        """Estimate the noise from the samples of a standing wheel."""
         if self.is_counter or not rates_rad_s:
             return
         squares = sum(map(mul, rates_rad_s, rates_rad_s)) / len(rates_rad_s)
-        # Some hundred samples are plenty; a slow mean forgets the residue of the last motion.
+        # A slow mean, so that the residual motion after a stop is averaged out.
         old = self.noise_rad2_s2
         self.noise_rad2_s2 = squares if old is None else old + 0.02 * (squares - old)
 
     def variance_rad2(self) -> float:
-        """Variance of the angle's bounded error: that of a count, next to nothing for an analogue encoder."""
+        """Variance of the angle's bounded error: that of one count, or almost zero for an analogue encoder."""
         if self.is_counter and self.quantum_rad < inf:
             return self.quantum_rad * self.quantum_rad * _COUNTER_NOISE
         return _MIN_VARIANCE_RAD2

@@ -1,4 +1,4 @@
-"""A robot at rest: when it begins, the noise of the sensors, what the inertial unit and gravity show."""
+"""A robot at rest: detection, noise of the sensors, means of the inertial unit, heading from gravity."""
 
 from collections.abc import Sequence
 from math import atan2, sqrt
@@ -8,14 +8,14 @@ from ccatp.core import GravitySample, ImuSample
 from ccatp.estimation.odometry import Slope
 
 _BLOCK = 15
-_MEMORY = 0.03  # weight of a new block: some thirty blocks are remembered
+_MEMORY = 0.03  # weight of a new block; the mean covers about thirty blocks
 
 
 class NoiseFloor:
-    """White-noise variance of a single sample, from means over blocks of a standing robot's samples.
+    """White-noise variance of a single sample, from means over blocks of samples at rest.
 
-    A vibration does not drift: within a block it averages out faster than white noise does. So the variance of block
-    means, times the block's length, is the part that the integral of the signal will feel.
+    Within a block a vibration averages out faster than white noise. So the variance of block means, times the block's
+    length, is the part of the noise that affects the integral of the signal.
     """
 
     def __init__(self, variance: float) -> None:
@@ -25,7 +25,7 @@ class NoiseFloor:
         self._before: float | None = None
 
     def restart(self) -> None:
-        """Another rest begins: a block does not reach across motion. A bias hardly moves from one rest to the next."""
+        """Begin another rest with a new block. The last mean is kept, because the bias hardly changes between rests."""
         self._sum, self._count = 0.0, 0
 
     def add(self, value: float) -> None:
@@ -43,7 +43,7 @@ class NoiseFloor:
 
 
 class ZeroVelocityReading(NamedTuple):
-    """Means over a rest; ``bearing_rad``: direction of gravity's part along the surface against the robot's x axis."""
+    """Means over a rest; ``bearing_rad``: downhill direction relative to the robot's x axis."""
 
     samples: int
     rate_rad_s: float
@@ -53,11 +53,11 @@ class ZeroVelocityReading(NamedTuple):
 
 
 class ZeroVelocityDetector:
-    """Counts frames without wheel motion and collects the inertial unit's samples at rest.
+    """Measures the time without wheel motion, and collects the inertial samples at rest.
 
-    A servo that coasts to its set point passes every threshold long before it stands. Only after ``rest_after_s``
-    without motion, several of its time constants, the robot counts as resting. ``count``: samples collected;
-    ``still_s``: time without motion.
+    A wheel that runs down is below every threshold long before it stands. So the robot counts as resting only after
+    ``rest_after_s`` without motion, several time constants of the servo. ``count``: samples collected; ``still_s``:
+    time without motion.
     """
 
     def __init__(self, rest_after_s: float, gyro: NoiseFloor, accelerometer: NoiseFloor) -> None:
@@ -72,12 +72,12 @@ class ZeroVelocityDetector:
         self._rate = self._acceleration = self._gx = self._gy = 0.0
 
     def moved(self) -> None:
-        """The wheels turned."""
+        """Take a frame in which the wheels turned."""
         self.still_s, self.is_resting = 0.0, False
         self._clear()
 
     def stood(self, dt_s: float) -> bool:
-        """The wheels stood for a frame; true when rest begins with it."""
+        """Take a frame in which the wheels stood; returns whether rest begins with it."""
         self.still_s += dt_s
         if self.is_resting or self.still_s < self._rest_after_s:
             return False
@@ -100,7 +100,7 @@ class ZeroVelocityDetector:
             self._gy += gravity[2]
 
     def take(self) -> ZeroVelocityReading:
-        """The means so far; collecting begins again."""
+        """The means so far; the next collection begins."""
         n = max(self.count, 1)
         found = ZeroVelocityReading(
             self.count, self._rate / n, self._acceleration / n, self._gravity_count, atan2(self._gy, self._gx)
@@ -110,7 +110,7 @@ class ZeroVelocityDetector:
 
 
 def heading_from_gravity(bearing_rad: float, slope: Slope) -> float:
-    """Deck heading of a robot that sees the downhill direction, not zero, at ``bearing_rad`` against its x axis."""
+    """Deck heading of a robot with the downhill direction (not zero) at ``bearing_rad`` from its x axis."""
     fx, fy = slope[0], slope[1]
     s2 = 1.0 + fx * fx
     s, norm = sqrt(s2), sqrt(s2 + fy * fy)

@@ -1,4 +1,4 @@
-"""Crossed seams: heading of an edge sensor pair (thesis 2.1.5), and each transition as a position measurement."""
+"""Seam crossings: heading from a pair of edge sensors (thesis 2.1.5), and each transition as a position measurement."""
 
 from collections.abc import Sequence
 from math import atan2, hypot, inf, pi, sqrt
@@ -15,8 +15,8 @@ from ccatp.mirror.layout import Seam
 from ccatp.mirror.mirror import Mirror
 
 _PAIRS = ((0, 1), (2, 3))  # front, rear: (left, right) in the order of EdgeSample
-# An edge is taken for a seam where the sensor is expected within this part of a panel's size from one. Whatever else
-# an edge can be (the rim, the next seam) is at least ten times further.
+# A transition is assigned to a seam within this part of a panel's size from the sensor's expected place. Other edges
+# (the rim, the next seam) are at least ten times further away.
 _REACH = 0.05
 _UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
 
@@ -28,17 +28,17 @@ def heading_from_pair(
     right_xy: tuple[float, float],
     normal_rad: float,
 ) -> tuple[float, float, float]:
-    """Heading of the robot when two of its sensors (robot frame, m) have crossed the same straight line.
+    """Heading of the robot from two of its sensors (robot frame, m) that have crossed the same straight line.
 
-    Both sensors stood on the line, so the vector between the two crossings, the sensors' own offset included, lies
-    along it. In the robot frame at the right sensor's crossing that vector is
+    Both sensors were on the line, so the vector between the two crossings, with the sensors' own offset, lies along it.
+    In the robot frame at the right sensor's crossing this vector is
     ``u = R(turn) left_xy - right_xy + displacement``, and with the line's normal at angle phi::
 
         theta + atan2(u_y, u_x) = phi + pi/2   (mod pi)
 
     In pure translation u = (s_left - s_right, w) and this is ``theta = phi + atan((s_left - s_right)/w)``, thesis eq.
     2.15 and 2.16 with a sign: positive travel is forward, so one formula holds for every edge, driven forward or in
-    reverse, whichever sensor is first. A turn between the two crossings is taken from the odometer.
+    reverse, with either sensor first. A turn between the two crossings is taken from the odometer.
 
     Returns the heading at the right sensor's crossing, rad, in the frame of ``normal_rad``, modulo pi; |u|, m; and the
     component of u across the robot, m.
@@ -62,17 +62,17 @@ class _Mark(NamedTuple):
 
 
 class HeadingFix(NamedTuple):
-    """A heading seen at a seam: how much it exceeds the estimate (rad) and its variance (rad^2)."""
+    """A heading measured at a seam: difference from the estimate (rad) and variance (rad^2)."""
 
     innovation_rad: float
     variance_rad2: float
 
 
 class CrossingDetector:
-    """Turns transitions of the edge sensors into headings.
+    """Computes headings from transitions of the edge sensors.
 
-    Both edges of a gap and both pairs count: up to four headings per seam. A heading is only taken where both sensors
-    of a pair crossed the same seam in the same sense, and between the two the robot moved on in near-pure translation.
+    Both edges of a gap and both pairs are used: up to four headings per seam. Both sensors of a pair must have crossed
+    the same seam in the same sense, with almost pure translation in between.
     """
 
     def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig) -> None:
@@ -85,13 +85,13 @@ class CrossingDetector:
         self._reach_m = _REACH * 2.0 * min(mirror.grid.half_x_m, mirror.grid.half_y_m)
 
     def restart(self) -> None:
-        """Forget everything seen: the robot's clock has jumped."""
+        """Drop all crossings, because the robot's clock has jumped."""
         self._scanner.restart()
         self._marks.clear()
         self._disturbed_s = -inf
 
     def scan(self, t_s: float, v_m_s: float, omega_rad_s: float, edges: Sequence[EdgeSample]) -> list[SensorTransition]:
-        """Note the motion at ``t_s`` and return the transitions of the frame, normally none."""
+        """Record the motion at ``t_s``, and return the transitions of the frame, normally none."""
         if abs(omega_rad_s) > self._cfg.crossing_max_rate_rad_s or abs(v_m_s) < self._cfg.crossing_min_speed_m_s:
             self._disturbed_s = t_s
         return self._scanner.scan(edges)
@@ -99,7 +99,7 @@ class CrossingDetector:
     def headings(
         self, transitions: Sequence[SensorTransition], odometer: Odometer, pose: PanelPose, deck: DeckPose, v_m_s: float
     ) -> list[HeadingFix]:
-        """Headings completed by a frame's transitions; odometer and deck pose belong to this frame."""
+        """Headings completed by a frame's transitions; odometer and poses are those of this frame."""
         found = []
         for transition in transitions:
             mark = self._mark(transition, odometer, deck)
@@ -139,20 +139,20 @@ class CrossingDetector:
         if seam is None or abs(seam.distance_m) > self._reach_m:
             return None
         place = odometer.at(transition.t_s)
-        # The point on the seam, for the direction of its tangent: the crossed coordinate is known from the map.
+        # The point on the seam, for the direction of its tangent. The map gives the coordinate across the seam.
         on_seam = (seam.position_m, y) if seam.axis == "x" else (x, seam.position_m)
         return _Mark(transition.t_s, transition.interval_s, place, seam, *on_seam)
 
     def _timing_variance(self, mark: _Mark) -> float:
-        """Variance of a transition's time, s^2: as configured, but never better than its sampling interval."""
+        """Variance of a transition's time, s^2: as configured, but at least that of its sampling interval."""
         return max(self._cfg.crossing_time_sigma_s**2, mark.interval_s**2 * _UNIFORM)
 
 
 class HeadingGate:
-    """Refuses a heading that does not fit the estimate, unless a second one confirms it.
+    """Refuses a heading that contradicts the estimate, unless a second one confirms it.
 
-    Two in a row that agree with each other show that the estimate is wrong and its variance too small; without this a
-    confident filter would refuse every true heading from then on.
+    Two agreeing headings in a row show that the estimate is wrong and its variance too small. Without this rule an
+    overconfident filter would refuse every true heading.
     """
 
     def __init__(self, gate_sigma: float) -> None:
@@ -160,13 +160,13 @@ class HeadingGate:
         self._refused: HeadingFix | None = None
 
     def extra_variance(self, seen: HeadingFix, prior_rad2: float) -> float | None:
-        """Variance (rad^2) by which the estimate has to be widened before it takes ``seen``; None = refused."""
+        """Variance (rad^2) to add to the estimate before it takes ``seen``; None: refused."""
         before, self._refused = self._refused, None
         if self._is_within(seen.innovation_rad, seen.variance_rad2 + prior_rad2):
             return 0.0
         if before is not None:
             apart = seen.innovation_rad - before.innovation_rad
-            # The estimate's own drift from one crossing to the next is part of what the two may differ by.
+            # The two may also differ by the drift of the estimate between the crossings.
             if self._is_within(apart, seen.variance_rad2 + before.variance_rad2 + prior_rad2):
                 return seen.innovation_rad**2
         self._refused = seen
@@ -180,10 +180,7 @@ _TIMING_FLOOR_M2 = 1e-10  # (10 um)^2: the sensor's own repeatability, UNVERIFIE
 
 
 class Edge(NamedTuple):
-    """A panel's edge that a sensor has crossed.
-
-    Deck axis ``k`` across it, index ``offset`` of the state of its displacement.
-    """
+    """A panel's edge crossed by a sensor; ``k``: deck axis across it; ``offset``: index of its displacement's state."""
 
     k: int
     position_m: float
@@ -192,11 +189,11 @@ class Edge(NamedTuple):
 
 
 class SeamLines:
-    """Turns transitions of the edge sensors into lines.
+    """Uses transitions of the edge sensors as measurements of the position along one axis.
 
-    An edge lies some tenths of a millimetre from where the map has it, but all four sensors cross the same edge: its
-    offset is a state, so that what they say *against each other* (heading, travel from front to rear) counts with the
-    precision of the timing, and only what they say together with that of the map.
+    An edge is some tenths of a millimetre off the map, but all four sensors cross the same edge, so its offset is a
+    state. Then the sensors *relative to each other* (heading, travel from front to rear) have the precision of the
+    timing, and only their common part has that of the map.
     """
 
     def __init__(self, mirror: Mirror, robot: RobotConfig) -> None:
@@ -207,18 +204,18 @@ class SeamLines:
         self._edges: dict[int, tuple[str, float, PanelId]] = {}
 
     def forget(self) -> None:
-        """The pose was found again: the offsets belong to another one."""
+        """Drop the edges after a relocation, because their offsets belong to the old pose."""
         self._edges.clear()
 
     def meet(self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:
-        """Which edge a transition belongs to, by the state x (n,); None where no seam is near."""
+        """The edge of a transition, by the state x (n,) at ``t_s``; None if no seam is near."""
         place, (along_x, along_y), _ = self._sensor(transition, t_s, x, slope)
         seam = self._mirror.nearest_seam(*place)
         if seam is None or abs(seam.distance_m) > self._reach_m:
             return None
         k = 0 if seam.axis == "x" else 1
         speed = (along_x, along_y)[k]
-        # The edge above or below the seam's centre line, and its panel.
+        # The edge on the high or low side of the seam's centre line, and its panel.
         is_high = (speed > 0.0) is transition.is_on
         inside = list(place)
         inside[k] = seam.position_m + (self._half[k] if is_high else -self._half[k])
@@ -234,9 +231,9 @@ class SeamLines:
     def line(
         self, edge: Edge, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope
     ) -> tuple[float, FloatArray, float]:
-        """What a transition over ``edge`` says about the state; arguments as in ``meet``.
+        """Measurement by a transition over ``edge``: ``sensor - edge - offset = 0`` along one axis.
 
-        ``sensor - edge - offset = 0`` along one axis: residual, m, the row (1, n) of the model, and variance, m^2.
+        Returns residual, m, row (1, n) of the model, and variance, m^2. Arguments as in ``meet``.
         """
         place, speeds, (forward, left, lever) = self._sensor(transition, t_s, x, slope, edge.k)
         late_s = t_s - transition.t_s
@@ -255,13 +252,13 @@ class SeamLines:
     def _sensor(
         self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope, k: int = 0
     ) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float]]:
-        """Place (m) and velocity (m/s) of a sensor at its transition; along axis k: heading, left, lever of a turn."""
+        """Place (m) and velocity (m/s) of a sensor at its transition, and h, l and lever of a turn along axis k."""
         late_s = t_s - transition.t_s
         ox, oy = self._sensors[transition.corner]
         x_m, y_m, psi, v, a, w = x[:6].tolist()
         v -= a * late_s
         hx, hy, lx, ly = axes_on(slope, psi - w * late_s)
-        # A point of the body moves by v h, and by w times its lever turned by a quarter.
+        # A point of the body moves with v h plus w times its offset turned by 90 deg.
         turn_x, turn_y = ox * lx - oy * hx, ox * ly - oy * hy
         place = x_m - v * late_s * hx + ox * hx + oy * lx, y_m - v * late_s * hy + ox * hy + oy * ly
         velocity = v * hx + w * turn_x, v * hy + w * turn_y

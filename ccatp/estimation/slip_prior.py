@@ -1,4 +1,4 @@
-"""Slip and creep of the next leg from the legs driven so far: means and scatter of what each leg draws again."""
+"""Prior of slip and creep for the next leg, from the means and the scatter of the legs driven so far."""
 
 from collections.abc import Sequence
 from math import exp, log
@@ -9,26 +9,25 @@ from ccatp.config.models import FullStateConfig
 from ccatp.core import FloatArray
 from ccatp.estimation.state_model import SLIPS
 
-# Candidates for the scatter, from "does not change" to "anything goes"; a factor of sqrt(2) apart.
+# Candidates for the scatter, from constant to arbitrary, a factor of sqrt(2) apart.
 _CANDIDATES = tuple(1e-7 * 2.0 ** (k / 2.0) for k in range(38))
-_FORGETTING = 0.99  # of the likelihoods per leg, so that a world that changes is noticed within a hundred legs
+_FORGETTING = 0.99  # of the likelihoods per leg, so that a change of the floor is noticed within a hundred legs
 _LEAST = 1e-14
 
 
 class SlipPopulation:
-    """Bayes for parameters drawn for each leg from N(mu_j, sigma^2): sigma common, all unknown.
+    """Bayesian estimate of parameters that each leg draws from N(mu_j, sigma^2), with unknown mu_j and common sigma.
 
-    After a leg its estimate y_j with variance R_j is one sample: y_j ~ N(mu_j, sigma^2 + R_j). Given sigma, the means
-    follow by the Kalman equations; each candidate of a grid of sigmas has means of its own and the weight that its
-    predictions have earned. So one set of constants serves a floor on which wheels never slip and one on which each leg
-    slips differently. ``expected``: mean and standard deviation of each mu before the first leg; ``scatter``: the
-    expectation of sigma^2.
+    The estimate y_j of a leg with variance R_j is one sample: y_j ~ N(mu_j, sigma^2 + R_j). For a given sigma the means
+    follow by the Kalman equations. Each candidate of a grid of sigmas has its own means, and a weight by the likelihood
+    of its predictions. So the same constants serve a floor without slip and one on which each leg slips differently.
+    ``expected``: mean and standard deviation of each mu before the first leg; ``scatter``: expectation of sigma^2.
     """
 
     def __init__(self, expected: Sequence[tuple[float, float]], largest: float) -> None:
         self._sigmas = [s for s in _CANDIDATES if s <= largest]
-        # Either the wheels hold, which is the smallest candidate, or they slip, and then nothing is known of the scale
-        # but its limits: its logarithm is uniform. Before the first leg one is as likely as the other.
+        # Either the wheels do not slip (the smallest candidate), or they slip with an unknown scale, whose logarithm is
+        # uniform. Before the first leg both are equally likely.
         self._prior = [log(max(len(self._sigmas) - 1, 1)), *[0.0] * (len(self._sigmas) - 1)]
         self._logs = [0.0] * len(self._sigmas)
         self._means = [[mean] * len(self._sigmas) for mean, _ in expected]
@@ -38,11 +37,9 @@ class SlipPopulation:
         self._mix()
 
     def learn(self, samples: Sequence[tuple[float, float] | None], share: float = 1.0) -> None:
-        """Take a leg's estimate of each parameter and its variance without the prior.
+        """Take a leg's estimate of each parameter with its variance, without the prior; None: not observed.
 
-        None where the leg says nothing of it.
-
-        ``share``: of sigma^2 in them, more than one where the parameters also wander within the leg.
+        ``share``: factor of sigma^2 in them; more than 1 if the parameters also wander within the leg.
         """
         self._logs = [_FORGETTING * likelihood for likelihood in self._logs]
         for sample, means, variances in zip(samples, self._means, self._variances, strict=True):
@@ -73,12 +70,12 @@ class SlipPopulation:
         self.scatter = sum(w * s * s for w, s in zip(weights, self._sigmas, strict=True))
 
 
-# A leg that has not narrowed the prior by more than rounding (variance after / before) has nothing to teach.
+# Ratio of the variances after and before a leg above which the leg has not observed a parameter.
 _TAUGHT = 0.9999
-# var(s_R - s_L) over var((s_R + s_L)/2), both wheels drawing from one population.
+# var(s_R - s_L) over var((s_R + s_L)/2) for two wheels of one population.
 _DIFFERENCE = 4.0
 
-# Parameters (mean slip, difference of the slips, both creeps) out of the states (SR, SL, C, CT), and back.
+# Matrix from the states (SR, SL, C, CT) to the parameters (mean slip, difference of slips, creeps), and its inverse.
 _PARAMETERS = np.eye(4)
 _PARAMETERS[:2, :2] = [[0.5, 0.5], [1.0, -1.0]]
 _STATES = np.linalg.inv(_PARAMETERS)
@@ -92,18 +89,18 @@ def _parameters_of(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray
 
 
 class SlipPrior:
-    """Carries slip and creep from leg to leg.
+    """Prior of slip and creep for each leg.
 
-    Right and left slip are taken apart into their mean (what the distance shows) and their difference (what the
-    heading shows). Both wheels draw from one population, so both show how much legs differ. Where legs hardly differ,
-    the next leg keeps the state and all its correlations; where each leg slips differently, it begins with the mean of
-    all legs. How much they differ is learned (``SlipPopulation``); creep varies by a share of itself.
+    Right and left slip are separated into their mean (observed by the distance) and their difference (observed by the
+    heading). Both wheels belong to one population, so both show how much legs differ. If legs hardly differ, the next
+    leg keeps the state with its correlations. If each leg slips differently, it begins with the mean of all legs. The
+    scatter of slip is learned (``SlipPopulation``); that of creep is a fixed part of its value.
 
-    Leg by leg a parameter is m + d: the mean m is unknown, d is drawn again with the learned scatter.
+    In each leg a parameter is m + d with an unknown mean m, and d drawn again with the learned scatter.
     """
 
     def __init__(self, cfg: FullStateConfig) -> None:
-        # Half the difference of two draws scatters as their mean does.
+        # Half the difference of two draws has the same variance as their mean.
         expected = (cfg.slip_mean, cfg.slip_sigma), (0.0, 0.5 * cfg.slip_difference_sigma)
         self._slip_scatter = SlipPopulation(expected, cfg.slip_scatter_max)
         self._means = np.array((cfg.slip_mean, 0.0, 0.0, 0.0))
@@ -113,7 +110,7 @@ class SlipPrior:
         self._wander = cfg.wander_fraction**2 / cfg.wander_time_s
         self._scatters = self._learned()
         self._is_open = False
-        self._wandered = 0.0  # variance of the mean slip's wander in this leg, part of the scatter
+        self._wandered = 0.0  # variance of the mean slip's wander in this leg, as a part of the scatter
 
     def _learned(self) -> tuple[float, float, float, float]:
         slip, squares = self._slip_scatter.scatter, np.square(self._means[2:]) + self._variances[2:]
@@ -126,7 +123,7 @@ class SlipPrior:
 
     @property
     def scatter(self) -> tuple[float, float]:
-        """Learned standard deviation from leg to leg of the mean slip and of the creep."""
+        """Learned standard deviations of the mean slip and of the creep from leg to leg."""
         return self._scatters[0] ** 0.5, self._scatters[2] ** 0.5
 
     def first(self) -> tuple[FloatArray, FloatArray]:
@@ -136,13 +133,13 @@ class SlipPrior:
         return _STATES.dot(means), (_STATES * variances).dot(_STATES.T)
 
     def begin(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A leg begins; the state before it, mean (n,) and covariance (n, n), ends the last one.
+        """Begin a leg from the state at the end of the last one, mean (n,) and covariance (n, n).
 
-        Transition of (right slip, left slip, creeps) to the next leg, s' = F s + b + e: F (4, 4), b (4,), and the
-        covariance (4, 4) of e.
+        Returns the transition of (right slip, left slip, creeps) to the next leg, s' = F s + b + e: F (4, 4), b (4,),
+        and the covariance (4, 4) of e.
         """
         found, known = _parameters_of(mean, covariance)
-        # A leg shows m by the share beta of what was not known of it; ``own`` is what is left.
+        # The gain with which a leg updates m is beta; ``own`` is the variance of m that remains.
         before, self._scatters = self._scatters, self._learned()
         beta = self._variances / (self._variances + before)
         own = self._variances * (1.0 - beta)
@@ -152,13 +149,13 @@ class SlipPrior:
         return F, _STATES.dot(self._means) - F.dot(mean[SLIPS]), Q
 
     def wander(self, dt_s: float) -> tuple[float, float, float]:
-        """Slip (of each wheel) and creeps wander within the leg for a step of ``dt_s``: by which variance."""
+        """Variances by which slip (of each wheel) and both creeps wander in a step of ``dt_s`` within the leg."""
         per_step = self._wander * dt_s
         self._wandered += per_step
         return 2.0 * per_step * self._scatters[0], per_step * self._scatters[2], per_step * self._scatters[3]
 
     def end(self, mean: FloatArray, covariance: FloatArray) -> None:
-        """A fix has ended the leg: learn how much legs differ from the state after it, (n,) and (n, n)."""
+        """End the leg at a fix: learn the scatter from the state after it, (n,) and (n, n)."""
         if not self._is_open:
             return
         self._is_open = False
@@ -171,7 +168,7 @@ class SlipPrior:
             if not 0.0 < known[k] < _TAUGHT * before:
                 alone.append(None)
                 continue
-            # The posterior divided by the prior, both Gaussian, is what the leg alone says.
+            # The Gaussian posterior divided by the prior is the likelihood of the leg alone.
             information = 1.0 / known[k] - 1.0 / before
             value = (found[k] / known[k] - means[k] / before) / information
             alone.append((scale * value, scale * scale * (1.0 / information)))
@@ -179,5 +176,5 @@ class SlipPrior:
             self._slip_scatter.learn(alone, 1.0 + self._wandered)
 
     def forget_leg(self) -> None:
-        """The leg's measurements are not to be trusted."""
+        """Drop the leg, whose measurements are not trusted."""
         self._is_open = False

@@ -1,4 +1,4 @@
-"""What is done to the full-state filter: steps of the motion, rests, legs, seams, fixes; and done again."""
+"""The steps of the full-state filter: motion, rest, legs, seams, fixes; and their replay for late measurements."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,12 +25,12 @@ _CALIBRATION_BLOCK = np.ix_(sm.CALIBRATION, sm.CALIBRATION)
 
 Step = Callable[[], object]
 LateStep = Callable[[float], None]
-"""A step that belongs to a moment before the state's: gets by how much, s."""
+"""A step for a measurement older than the state; gets its age relative to the state, s."""
 _SAME_TIME_S = 1e-6
 
 
 class SurveyFilter:
-    """The filter of ``STATES`` states with its models; the ``journal`` does each step, and does it again."""
+    """The filter of ``STATES`` states with its models. The ``journal`` executes each step, and replays it."""
 
     def __init__(self, filter_: Filter, mirror: Mirror, cfg: Config, counts: dict[str, int], start: DeckPose) -> None:
         robot = cfg.robot
@@ -49,11 +49,11 @@ class SurveyFilter:
         self._gravity_deck = mirror.gravity_deck
         filter_.reset(*self._first(start))
         self._keep_calibration()
-        self._is_trusted = True  # what odometry did since the last fix
+        self._is_trusted = True  # odometry since the last fix
         self._panel = self._panel_below()
 
     def _first(self, pose: DeckPose) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of who knows a pose and nothing else."""
+        """Mean and covariance when only the pose is known."""
         cfg, full = self._cfg, self._full
         mean, sigma = np.zeros(sm.STATES), np.zeros(sm.STATES)
         mean[sm.POSE] = pose.x_m, pose.y_m, pose.heading_rad
@@ -68,7 +68,7 @@ class SurveyFilter:
         return mean, P
 
     def slope(self) -> Slope:
-        """The ground under the estimated position."""
+        """Slope of the ground at the estimated position."""
         mean = self._filter.mean
         return self.terrain.at(float(mean[sm.X]), float(mean[sm.Y]))
 
@@ -90,7 +90,7 @@ class SurveyFilter:
         slips = self._legs.wander(block.turning_s) if dt_s > 0.0 else (0.0, 0.0, 0.0)
         encoders = self.encoder_walk(right) * dt_s
         readings = []
-        # The rate before the angles: the other way round little is left of its variance, and digits go with the rest.
+        # The rate before the angles: after them its variance would be so small that digits are lost.
         if block.rate_rad_s is not None:
             readings.append((sm.W, block.rate_rad_s, imu_variances[0] / block.samples))
         if right.is_fresh or left.is_fresh:
@@ -99,7 +99,7 @@ class SurveyFilter:
             for state, (angle_rad, lag_rad2) in ((sm.PR, right.angle_at(t_s)), (sm.PL, left.angle_at(t_s))):
                 readings.append((state, angle_rad, variance + lag_rad2))
         if block.acceleration_m_s2 is not None and self._full.use.accelerometer:
-            # Set points jump, and the acceleration with them, anywhere between two samples.
+            # The set points, and so the acceleration, may jump at any time between two samples.
             jump = self._full.acceleration_jump_m_s2**2
             readings.append((sm.A, block.acceleration_m_s2, imu_variances[1] / block.samples + jump))
         rows = sm.SensorRows(readings) if readings else None
@@ -129,10 +129,10 @@ class SurveyFilter:
         motion = self._motion.over(dt_s, self.slope(), share)
         jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
         impulses = np.array((jerk, twist, slip, slip, creep, turn_creep))
-        drift = self._drift  # work space, of which the model keeps nothing
+        drift = self._drift  # work space; the model does not keep it
         drift[sm.BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
         drift[sm.BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
-        # A tyre that gives way does so downhill in the main, and as it likes besides; what it loses of a turn varies.
+        # The creep of a turn is mainly downhill, with a random part in any direction; the loss of a turn varies, too.
         creep, turned_rad = share * float(mean[sm.CT]), abs(float(mean[sm.W])) * dt_s
         drift[sm.X] = drift[sm.Y] = (full.turn_creep_aside * creep) ** 2 * turned_rad
         lost = (self._base_per_radius * full.turn_loss_per_creep) ** 2 * turned_rad
@@ -141,7 +141,7 @@ class SurveyFilter:
         self._filter.predict(motion, motion.noise(self._filter.mean, impulses, drift))
 
     def encoder_walk(self, wheel: WheelAngle) -> float:
-        """Growth of the summed angle's error per second: white rate noise, none where a counter counts."""
+        """Growth of the variance of the angle per second by white rate noise; none for a counting encoder."""
         found = wheel.noise_rad2_s2
         variance = self._cfg.encoder_sigma_rad_s**2 if found is None else found
         return variance * self._full.encoder_period_s
@@ -149,7 +149,7 @@ class SurveyFilter:
     # -- rest and legs ------------------------------------------------------------------------------------------------
 
     def stop(self, angles: tuple[float, float]) -> None:
-        """The wheels stand, at these angles (rad): no speed, no acceleration, no rate; they count from here."""
+        """Zero-velocity update: the wheels stand at these angles (rad), which are set to zero."""
         full = self._full
         R = np.square((full.rest_speed_sigma_m_s, full.rest_acceleration_sigma_m_s2, full.rest_turn_sigma_rad_s))
         shift = np.zeros(sm.STATES)
@@ -160,7 +160,7 @@ class SurveyFilter:
         self.journal.do(lambda: self._filter.predict(rebase, np.zeros((sm.STATES, sm.STATES))))
 
     def calibrate(self, reading: ZeroVelocityReading, rested_s: float, imu_variances: tuple[float, float]) -> None:
-        """Biases from the inertial unit's means over a rest of ``rested_s``, heading from gravity."""
+        """Update biases from the inertial unit's means over a rest of ``rested_s``, and the heading from gravity."""
         full, n = self._full, reading.samples
         Q = np.zeros((sm.STATES, sm.STATES))
         Q[sm.BG, sm.BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * rested_s
@@ -168,7 +168,7 @@ class SurveyFilter:
         self.journal.do(lambda: self._filter.predict(np.eye(sm.STATES), Q))
         if full.use.rest_biases:
             H = np.zeros((2, sm.STATES))
-            # v, a and w stay what the stop made of them; the scale error acts on a rate of zero.
+            # v, a and w are zero since the stop, so that the scale error has no effect.
             H[0, sm.BG] = H[0, sm.W] = H[1, sm.BA] = H[1, sm.A] = 1.0
             z = np.array((reading.rate_rad_s, reading.acceleration_m_s2))
             R = np.array((imu_variances[0] / n, imu_variances[1] / n))
@@ -195,7 +195,7 @@ class SurveyFilter:
         self._filter.update(np.array([float(mean[sm.PSI]) + residual]), H, np.array([variance]))
 
     def begin_leg(self) -> None:
-        """Slip and creep of the coming leg, from the legs so far."""
+        """Predict slip and creep of the next leg from the legs so far."""
         if self._full.use.slip_per_leg:
             F, b, Q = np.eye(sm.STATES), np.zeros(sm.STATES), np.zeros((sm.STATES, sm.STATES))
             F[_SLIP_BLOCK], b[sm.SLIPS], Q[_SLIP_BLOCK] = self._legs.begin(self._filter.mean, self._filter.covariance)
@@ -203,12 +203,12 @@ class SurveyFilter:
         self.journal.do(self._keep_calibration)
 
     def _keep_calibration(self) -> None:
-        """What is known of it where a leg begins or ends: should the leg turn out wrong, it has taught nothing."""
+        """Save the calibration at the begin and end of a leg, to restore it if the leg is found to be wrong."""
         mean, P = self._filter.mean, self._filter.covariance
         self._calibration = mean[sm.CALIBRATION], P[_CALIBRATION_BLOCK]
 
     def _restored(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The state with the calibration as kept, not correlated with the rest: a fix then corrects the pose alone."""
+        """The state with the saved calibration, uncorrelated with the rest, so that a fix corrects only the pose."""
         x, P = mean.copy(), covariance.copy()
         P[sm.CALIBRATION, :] = P[:, sm.CALIBRATION] = 0.0
         x[sm.CALIBRATION], P[_CALIBRATION_BLOCK] = self._calibration
@@ -217,7 +217,7 @@ class SurveyFilter:
     # -- seams --------------------------------------------------------------------------------------------------------
 
     def cross(self, transition: SensorTransition, t_s: float) -> None:
-        """An edge sensor has changed its value; the state belongs to ``t_s``."""
+        """Update with a transition of an edge sensor; ``t_s``: time of the state."""
         full, filter_ = self._full, self._filter
         edge = self._seams.meet(transition, t_s, filter_.mean, self.slope()) if full.use.seams else None
         if edge is None:
@@ -237,7 +237,7 @@ class SurveyFilter:
         self.journal.do(step)
 
     def _renew(self, states: list[int], sigma: float) -> None:
-        """States are given to other edges or panels: nothing known of them, nothing correlated."""
+        """Reset states for another edge or panel: standard deviation ``sigma``, no correlations."""
         F, Q = np.eye(sm.STATES), np.zeros((sm.STATES, sm.STATES))
         F[states, states] = 0.0
         Q[states, states] = sigma * sigma
@@ -246,9 +246,9 @@ class SurveyFilter:
     # -- fixes --------------------------------------------------------------------------------------------------------
 
     def fix(self, t_s: float, z: FloatArray, variance: FloatArray) -> int:
-        """The robot's origin at ``t_s``, deck, m (2,), and its covariance (2, 2).
+        """Update with the robot's origin at ``t_s``, deck frame, m (2,), and its covariance (2, 2); ends the leg.
 
-        It ends the leg. Returns how many steps were repeated after it.
+        Returns the number of later entries that were replayed.
         """
         is_trusted, self._is_trusted = self._is_trusted, True
         if not is_trusted:
@@ -269,7 +269,7 @@ class SurveyFilter:
         return repeated
 
     def expect(self, t_s: float, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How far a position (2,) lies from what the filter held for true at ``t_s``, and the covariance of that."""
+        """Residual of a position (2,) against the estimate at ``t_s``, and the covariance of the estimate (2, 2)."""
         mean, P, late_s = self.journal.look(t_s)
         residual, H = fix_row(z, mean, self.terrain.at(float(mean[sm.X]), float(mean[sm.Y])), late_s)
         return residual, H.dot(P).dot(H.T)
@@ -277,10 +277,10 @@ class SurveyFilter:
     def relocate(
         self, residual: FloatArray, variance: FloatArray, turn_rad: float, *, is_lost: bool, again: bool
     ) -> None:
-        """Begin again ``residual`` (2,) from the estimate, known to a covariance (2, 2); see ``relocated``.
+        """Move the estimate by ``residual`` (2,), with covariance ``variance`` (2, 2); see ``relocated``.
 
-        The heading is doubted by ``turn_rad``, and never by less than a set angle. ``again``: what was learned of the
-        sensors and of slip since the last time was misleading, and is forgotten, too. Raises ``FilterDiverged``: not
+        ``turn_rad``: standard deviation added to the heading, at least ``relocated_heading_sigma_rad``. ``again``: no
+        fix has agreed since the last relocation, so calibration and slip are reset, too. Raises ``FilterDiverged``: not
         finite.
         """
         mean, P = self._restored(self._filter.mean, self._filter.covariance)
@@ -302,9 +302,9 @@ class SurveyFilter:
         self._panel = self._panel_below()
 
     def inflate_covariance(self, way_m: float, turn_rad: float) -> None:
-        """The robot may have gone this far, and turned, without anyone looking: the next fix corrects the pose alone.
+        """Inflate the covariance of the pose by an unobserved motion; the next fix then corrects only the pose.
 
-        What odometry did since the leg began, and does until the fix, teaches nothing of slip, creep and the sensors.
+        The odometry from the begin of the leg to that fix is not used to learn slip, creep and sensor errors.
         """
         self._is_trusted = False
         Q = np.zeros((sm.STATES, sm.STATES))
@@ -315,20 +315,20 @@ class SurveyFilter:
 
 @dataclass(slots=True, eq=False)
 class _Entry:
-    """The state before some steps, the time to which they bring it, and how long the robot may have moved in them."""
+    """The state before some steps, its time after them, and how long the robot may have moved in them."""
 
     t_s: float
     dt_s: float
     mean: FloatArray
     covariance: FloatArray
-    kept_s: float  # the steps are those since then
+    kept_s: float  # begin of the steps
     steps: list[Step] = field(default_factory=list)
 
 
 class ReplayBuffer:
-    """Does the steps of a filter, and rewinds and replays them for late measurements, at most ``reach_s`` back.
+    """Executes the steps of a filter, and rewinds and replays them for late measurements, at most ``reach_s`` back.
 
-    A filter replaces its arrays and never changes them, so keeping a state costs a reference.
+    A filter replaces its arrays and never changes them, so a stored state costs only a reference.
     """
 
     def __init__(self, filter_: Filter, reach_s: float) -> None:
@@ -338,45 +338,45 @@ class ReplayBuffer:
 
     @property
     def oldest_s(self) -> float:
-        """The earliest time at which a measurement can still be taken: from the end of the first entry on."""
+        """The earliest time of a measurement that can be taken: the end of the first entry."""
         return self._entries[0].t_s if self._entries else float("-inf")
 
     def restart(self) -> None:
-        """The robot's clock has jumped."""
+        """Drop all entries."""
         self._entries.clear()
 
     def begin(self, t_s: float, dt_s: float) -> None:
-        """Steps follow that bring the state to ``t_s``; the robot may have moved during the last ``dt_s`` of it."""
+        """Begin the steps that advance the state to ``t_s``; the robot may have moved in the last ``dt_s`` of them."""
         entries, filter_ = self._entries, self._filter
         if dt_s == 0.0 and entries and entries[-1].dt_s == 0.0:
             entries[-1].t_s = t_s  # a standstill, however long, is one entry
             if entries[-1].kept_s < t_s - self._reach_s:
-                # Forget how the state of a long standstill came about: nothing grows however long the robot stands,
-                # and the present state is as good as the one before the steps.
+                # Drop the steps of a long standstill to bound the memory; the present state is as good as the one
+                # before them.
                 del entries[:-2]
                 for entry in entries:
                     entry.kept_s, entry.mean, entry.covariance = t_s, filter_.mean, filter_.covariance
                     entry.steps.clear()
             return
         entries.append(_Entry(t_s, dt_s, filter_.mean, filter_.covariance, t_s))
-        # Two entries at least: a standstill may outlast the reach, and its beginning is where its fix belongs.
+        # At least two entries: a standstill may be longer than the reach, and its fix belongs to its beginning.
         while len(entries) > 2 and entries[1].t_s < t_s - self._reach_s:
             del entries[0]
 
     def do(self, step: Step) -> None:
-        """Do a step of the present entry, and keep it."""
+        """Execute a step of the present entry, and store it."""
         if self._entries:
             self._entries[-1].steps.append(step)
         step()
 
     def look(self, t_s: float) -> tuple[FloatArray, FloatArray, float]:
-        """The first state not before ``t_s``: its mean, its covariance, and by how much it is later, s."""
+        """The first state not before ``t_s``: its mean and covariance, and how much later it is, s."""
         later, late_s = self._since(t_s)
         at = later[0] if later else self._filter
         return at.mean, at.covariance, late_s
 
     def _since(self, t_s: float) -> tuple[list[_Entry], float]:
-        """The entries after the first state not before ``t_s``, and how much motion lies between it and that state."""
+        """The entries after the first state not before ``t_s``, and the time of motion from ``t_s`` to it, s."""
         entries, k = self._entries, len(self._entries)
         while k and entries[k - 1].t_s >= t_s - _SAME_TIME_S:
             k -= 1
@@ -386,7 +386,7 @@ class ReplayBuffer:
         return entries[k + 1 :], min(max(home.t_s - t_s, 0.0), home.dt_s)
 
     def take(self, t_s: float, step: LateStep) -> int:
-        """Do ``step`` to the first state not before ``t_s`` and all later ones again; returns how many these are."""
+        """Apply ``step`` to the first state not before ``t_s``, and replay the later entries; returns their number."""
         later, late_s = self._since(t_s)
         filter_ = self._filter
         if later:

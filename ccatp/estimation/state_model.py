@@ -1,8 +1,8 @@
-"""The full-state model: how pose, speeds and the sensors' errors move on, and what the sensors see of them.
+"""The full-state model: transition of pose, speeds and sensor errors, and the measurements.
 
-The pose is kept in the deck frame, on the curved surface, so no panel change touches the state. The wheel angles are
-states: the encoders' counts measure them with an error that never grows, which is what makes a counting encoder worth
-more than its rate (a rate out of counts jumps by 0.5 rad/s per 10 ms).
+The pose is in the deck frame, on the curved surface, so a change of the panel does not affect the state. The wheel
+angles are states, because the counts of an encoder measure them with a bounded error. Its rate is much worse: a rate
+from counts jumps by 0.5 rad/s per 10 ms.
 """
 
 from collections.abc import Sequence
@@ -36,18 +36,17 @@ X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, PR, PL, E0, E1, TX, TY, CT = rang
 X, Y: robot origin, deck frame, m. PSI: deck heading, rad, not wrapped. V: speed that the wheels give the body over the
 last step, m/s. A: its rate of change, m/s^2. W: rate about the normal over the last step, rad/s. BG: gyroscope bias,
 rad/s. KG: gyroscope scale error. BA: accelerometer bias, m/s^2. SR, SL: slip of the right and of the left wheel, the
-part of its travel that the body does not follow (an error of the radius included). KL: relative error of the wheel
-base. C, CT: downhill creep, part of |V|, and of |W|, m/rad, the mean of all headings. PR, PL: angle of the right and of
-the left wheel since the last rest, rad. E0, E1: how far the two edges of the seam crossed last lie from where the map
-has them, m. TX, TY: by how much the puck is off its place over the robot because the panel under it is tilted, deck
-frame, m.
+part of its travel that the body does not follow (with the error of the radius). KL: relative error of the wheel base.
+C, CT: downhill creep, part of |V|, and of |W|, m/rad, mean over all headings. PR, PL: angle of the right and of the
+left wheel since the last rest, rad. E0, E1: displacement from the map of the two edges of the seam crossed last, m. TX,
+TY: displacement of the puck by the tilt of the panel under the robot, deck frame, m.
 """
 STATES = 20
 POSE, SPEEDS, SLIPS, ANGLES, EDGES, TILT = [X, Y, PSI], [V, A, W], [SR, SL, C, CT], [PR, PL], [E0, E1], [TX, TY]
 CALIBRATION = [BG, KG, BA, SR, SL, KL, C, CT]
-_NOISY = np.array([A, W, SR, SL, C, CT])  # whose noise enters at the beginning of a step and is carried through it
-_MOVED = np.array([X, Y, PSI, V, PR, PL])  # by a step, in the order of `SurveyMotion.at`
-# Entries of the motion's Jacobian beside those of the identity, as `SurveyMotion.at` lists them: one call sets all.
+_NOISY = np.array([A, W, SR, SL, C, CT])  # states whose noise enters at the beginning of a step
+_MOVED = np.array([X, Y, PSI, V, PR, PL])  # states that a step changes, in the order of `SurveyMotion.at`
+# Entries of the motion's Jacobian besides the identity, in the order of `SurveyMotion.at`, which sets all in one call.
 _COLUMNS: dict[int, tuple[int, ...]] = dict.fromkeys((X, Y, PSI), (PSI, V, A, W, C, CT))
 _COLUMNS |= {V: (A,), PR: (V, A, W, SR, KL), PL: (V, A, W, SL, KL)}
 _ENTRIES = np.array([row * STATES + column for row, columns in _COLUMNS.items() for column in columns])
@@ -65,7 +64,7 @@ class SurveyMotion:
 
     h and g are the deck components of the heading and of the downhill direction in the tangent plane; share is the
     creep of a turn at this heading over its mean. The noise of a step is an impulse at its beginning (see
-    ``ConstantAcceleration``), so v', a and w hold for the whole of it.
+    ``ConstantAcceleration``), so v', a and w are constant in the step.
     """
 
     def __init__(self, wheel_radius_m: float, wheel_base_m: float) -> None:
@@ -74,14 +73,14 @@ class SurveyMotion:
         self._flat = self._F.reshape(-1)
 
     def over(self, dt_s: float, slope: Slope, creep_share: float = 1.0) -> "SurveyMotion":
-        """Set the step's duration, the ground under it, and ``share``."""
+        """Set the duration of the step, the slope of the ground, and ``share``."""
         self._dt_s, self._slope, self._share = dt_s, slope, creep_share
         self._of: FloatArray | None = None
         return self
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The state after the step (n,) and the Jacobian (n, n); work space that holds until the next call."""
-        if x is self._of:  # the same arrays again: the filter asks for what the noise has asked for already
+        """The state after the step (n,) and the Jacobian (n, n); work space, valid until the next call."""
+        if x is self._of:  # computed already, for the noise
             return self._x, self._F
         self._of = x
         state: list[float] = x.tolist()
@@ -121,7 +120,7 @@ class SurveyMotion:
         return self._x, self._F
 
     def through(self, points: FloatArray) -> FloatArray:
-        """The states (k, n) after the step, one for each row."""
+        """The states (k, n) after the step, row by row."""
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
         x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_, ct = points.T
         v = v + a * dt
@@ -155,18 +154,18 @@ class SurveyMotion:
         return Q
 
 
-_SENSORS = np.eye(STATES)  # Jacobian of a reading of each state; that by the scale error is set where it is used
+_SENSORS = np.eye(STATES)  # Jacobian of a reading of each state; `SensorRows.at` adds the gyroscope's scale error
 _SENSORS[W, BG] = _SENSORS[A, BA] = 1.0
 
 
 class SensorRows:
-    """What one frame measures: wheel angles, angular rate, acceleration; any of them may be missing.
+    """Measurements of a frame: wheel angles, angular rate, acceleration; each may be missing.
 
     ::
 
         counts_R = phi_R,   counts_L = phi_L,   omega_z = (1 + kg) w + bg,   a_x = a + ba
 
-    A reading is the state it is of, its value and its variance; one of W stands first, one of A last. ``z`` and ``R``
+    A reading is (index of its state, value, variance); that of W comes first, that of A last. ``z`` and ``R``
     (variances) have shape (m,).
     """
 

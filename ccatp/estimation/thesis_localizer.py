@@ -1,4 +1,4 @@
-"""The localizer of thesis chapter 2: four states in a filter (eqs 2.4 to 2.12), the pose integrated beside it."""
+"""The localizer of thesis chapter 2: a filter of four states (eqs 2.4 to 2.12), and the integrated position."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -44,7 +44,7 @@ Stack = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class MeasurementBuilder:
-    """Builds z, H, R of a frame: rows in the order right wheel, left wheel, acceleration, rate (oldest first in each).
+    """Builds z, H, R of a frame; rows: right wheel, left wheel, acceleration, rate, each with the oldest first.
 
     The full model (thesis eq. 2.12) is::
 
@@ -55,8 +55,8 @@ class MeasurementBuilder:
 
     Eq. 2.3 and 2.4 print theta_z with a row that picks theta; a gyroscope measures a rate, so omega_z of 2.12 holds.
 
-    A sample taken at t_i belongs to the state q(t_i), not to q(t) at the frame's time t. Within a frame acceleration
-    and rate are taken as constant, so q(t_i) = F(t_i - t) q(t) with F of eq. 2.11 and a row h becomes h F(t_i - t). The
+    A sample at t_i belongs to the state q(t_i), not to q(t) at the frame's time t. Within a frame acceleration and rate
+    are assumed constant, so q(t_i) = F(t_i - t) q(t) with F of eq. 2.11, and a row h becomes h F(t_i - t). This is an
     approximation: all process noise of the interval enters at its beginning. ``cfg`` has standard deviations of single
     samples (thesis eq. 2.17 calls sigma a variance; its table 2.1 lists standard deviations).
     """
@@ -71,10 +71,7 @@ class MeasurementBuilder:
         self._of_size = lru_cache(maxsize=256)(self._build)
 
     def stack(self, t_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings) -> Stack:
-        """Stack of a frame with any number of samples; of each wheel the times (s) and the rates (rad/s).
-
-        The arrays are work space: they hold until the next call.
-        """
+        """z, H, R of a frame with any number of samples. The arrays are work space, valid until the next call."""
         wheels, n = len(right[0]) + len(left[0]), len(imu)
         stack = z, H, _ = self._of_size(len(right[0]), len(left[0]), n)
         for i, (t, rate) in enumerate(zip((*right[0], *left[0]), (*right[1], *left[1]), strict=True)):
@@ -114,7 +111,7 @@ class ConstantAcceleration:
         self._F, self._Q = np.eye(STATES), np.zeros((STATES, STATES))
 
     def over(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
-        """F and Q (4, 4) over dt_s; work space that holds until the next call."""
+        """F and Q (4, 4) over dt_s; work space, valid until the next call."""
         F, Q = self._F, self._Q
         F[V, A] = F[THETA, OMEGA] = dt_s
         for i, density in ((V, self._jerk), (THETA, self._alpha)):
@@ -130,10 +127,10 @@ _SELECT_HEADING = np.eye(STATES)[THETA : THETA + 1]
 
 
 class PositionSigma:
-    """Standard deviation of the position along any one direction.
+    """Standard deviation of the position in any one direction.
 
-    Slip and a heading error last from one fix to the next, so their contributions grow with the travel, not with its
-    root: sigma^2 = fix^2 + (slip_fraction s)^2 + (integral of sigma_theta ds)^2.
+    Slip and heading error are constant from one fix to the next, so their contributions grow with the travel s, not
+    with its square root: sigma^2 = fix^2 + (slip_fraction s)^2 + (integral of sigma_theta ds)^2.
     """
 
     def __init__(self, sigma_m: float, slip_fraction: float) -> None:
@@ -147,12 +144,12 @@ class PositionSigma:
         return sqrt(self._known_m2 + self._along_m**2 + self._across_m**2)
 
     def travel(self, distance_m: float, heading_sigma_rad: float) -> None:
-        """The robot moved on by ``distance_m`` >= 0 at a heading known to ``heading_sigma_rad``."""
+        """Add a travel of ``distance_m`` >= 0, with standard deviation ``heading_sigma_rad`` of the heading."""
         self._along_m += self._slip_fraction * distance_m
         self._across_m += heading_sigma_rad * distance_m
 
     def growth_m2(self, distance_m: float, heading_sigma_rad: float) -> float:
-        """Variance that a displacement of ``distance_m`` alone brings in, m^2."""
+        """Variance that a displacement of ``distance_m`` adds, m^2."""
         return distance_m**2 * (self._slip_fraction**2 + heading_sigma_rad**2)
 
     def widen(self, sigma_m: float) -> None:
@@ -171,10 +168,10 @@ class PositionSigma:
 class FourStateLocalizer(LocalizerBase):
     """Estimates the pose (x, y, theta)_p (thesis 2.1, fig. 2.5).
 
-    Each frame: the filter predicts over the time since the last frame and is updated with every usable sample at its
-    own time (``MeasurementBuilder``); speed and heading move the position (eq. 2.14); a seam crossed by a pair of edge
-    sensors updates the heading. Where the robot's origin enters another cell, pose and heading continue in the frame of
-    that panel. Departure: the thesis overwrites the heading at a crossing; here it is a measurement of theta with the
+    In each frame the filter predicts over the time since the last frame, and is updated with every usable sample at its
+    own time (``MeasurementBuilder``). Speed and heading move the position (eq. 2.14). A seam crossed by a pair of edge
+    sensors updates the heading. When the robot's origin enters another cell, the pose continues in the frame of that
+    panel. Departure: the thesis overwrites the heading at a crossing; here it is a measurement of theta with the
     variance of its timing, so that state and covariance stay consistent.
     """
 
@@ -200,7 +197,7 @@ class FourStateLocalizer(LocalizerBase):
 
     @property
     def deck_pose(self) -> DeckPose:
-        """The same in the deck frame."""
+        """Estimated pose, deck frame."""
         if self._deck is None:
             self._deck = self._mirror.deck_pose(self.pose)
         return self._deck
@@ -227,7 +224,7 @@ class FourStateLocalizer(LocalizerBase):
 
     @property
     def creep(self) -> tuple[float, float]:
-        """Estimated drift per metre of travel: none in this model."""
+        """Drift per metre of travel; zero in this model."""
         return 0.0, 0.0
 
     def _use(
@@ -241,9 +238,7 @@ class FourStateLocalizer(LocalizerBase):
             self._use_crossings(transitions)
 
     def reset_filter(self, mu: FloatArray, sigma: FloatArray) -> None:
-        """Re-initialise the state (v, a, theta, omega), theta in the panel frame.
-
-        The thesis's ``resetFilter(mu, Sigma)``.
+        """Re-initialise the state (v, a, theta, omega), theta in the panel frame; thesis: ``resetFilter(mu, Sigma)``.
 
         Raises ``FilterError``: not a Gaussian of four states.
         """
@@ -256,33 +251,33 @@ class FourStateLocalizer(LocalizerBase):
     def rest(self) -> None:
         """The robot stands: v, a and omega are zero with the configured sigmas, the heading keeps its variance.
 
-        The rows and columns of the three go with them: the thesis resets diagonal entries only, which leaves
-        correlations that no longer fit. To be called at standstill; while coasting it makes the filter overconfident.
+        Their rows and columns of the covariance are reset, too. The thesis resets only the diagonal, which leaves wrong
+        correlations. Call it at standstill; while the wheels run down it makes the filter overconfident.
         """
         if not self.is_frozen:
             mean, covariance = self._filter.mean, self._filter.covariance
             self._reset_at_rest(float(mean[THETA]), float(covariance[THETA, THETA]))
 
     def fuse_fix(self, fix: Fix) -> float:
-        """Fuse a position of the puck (thesis 2.1.3) at the time it was taken; returns how far the pose jumped, m.
+        """Fuse a position of the puck (thesis 2.1.3) at the time of its measurement; returns the jump of the pose, m.
 
         Position and fix are weighted by their variances. Raises ``FixRefused``: not finite, too old, from the future,
         or far from the mirror; the pose is unchanged.
         """
         foot = self._foot_of(fix, self._odometer.oldest_s)
         place = self._mirror.panel_pose(self._panel, DeckPose(foot.x_m, foot.y_m, 0.0))  # the heading plays no part
-        # Of the fix's covariance only the part along the surface counts: half its trace without the normal's share.
+        # Only the covariance along the surface is used: half of its trace without the part along the normal.
         normal = np.array(self._mirror.rotate_world_from_deck(self._mirror.surface.normal(foot.x_m, foot.y_m)))
         covariance = np.array(fix.covariance_m2).reshape(3, 3)
         variance = 0.5 * float(np.trace(covariance) - normal @ covariance @ normal)
         then, here = self._odometer.at(fix.t_s), self._odometer.place
-        # The odometer's frame is turned against the panel's by the difference of their headings.
+        # The odometer's frame is rotated relative to the panel's by the difference of the headings.
         turned = float(self._filter.mean[THETA]) - here.heading_rad
         dx, dy = rotate(here.x_m - then.x_m, here.y_m - then.y_m, turned)
         ex, ey = place.x_m + dx - self._x_m, place.y_m + dy - self._y_m
         variance += self._sigma.growth_m2(hypot(dx, dy), self.heading_sigma_rad)
         if self.is_frozen:
-            # Whatever turned the filter over may have turned the heading as well.
+            # The cause of the divergence may have changed the heading as well.
             prior = float(self._filter.covariance[THETA, THETA]) + self._cfg.start_heading_sigma_rad**2
             self._reset_at_rest(float(self._filter.mean[THETA]), prior)
             self._sigma.widen(self._cfg.start_position_sigma_m)
@@ -316,7 +311,7 @@ class FourStateLocalizer(LocalizerBase):
             self._hand_over()
 
     def _hand_over(self) -> None:
-        """Continue in the frame of the panel whose cell holds the robot's origin; the deck pose stays the same."""
+        """Continue in the frame of the panel whose cell contains the robot's origin; the deck pose does not change."""
         deck = self.deck_pose
         panel = self._mirror.panel_at(deck.x_m, deck.y_m)
         if panel is None or panel == self._panel:
@@ -358,7 +353,7 @@ class FourStateLocalizer(LocalizerBase):
         self.reset_filter(np.array([0.0, 0.0, heading_rad, 0.0]), np.diag(variances))
 
     def inflate_covariance(self, way_m: float, turn_rad: float) -> None:
-        """The pose may be wrong by this much, because what it was made of was: the pose stays, its certainty goes."""
+        """Inflate the covariance of the pose by these standard deviations, because its inputs may have been wrong."""
         if self.is_frozen:
             return
         self._sigma.widen(way_m)
