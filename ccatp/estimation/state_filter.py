@@ -174,9 +174,9 @@ class SurveyFilter:
             R = np.array((imu_variances[0] / n, imu_variances[1] / n))
             self.journal.do(lambda: self._filter.update(z, H, R))
         if reading.gravity_count and full.use.gravity:
-            self.journal.do(lambda: self._feel_gravity(reading.bearing_rad, reading.gravity_count))
+            self.journal.do(lambda: self._update_with_gravity(reading.bearing_rad, reading.gravity_count))
 
-    def _feel_gravity(self, bearing_rad: float, count: int) -> None:
+    def _update_with_gravity(self, bearing_rad: float, count: int) -> None:
         mean, full = self._filter.mean, self._full
         slope = self.slope()
         gx, gy, gz = self._gravity_deck
