@@ -1,8 +1,8 @@
 """The list of alarms of a run: what is wrong, since when, what to do, and who has acknowledged it.
 
-An alarm is a condition of ``ccatp.conditions`` by its name; while it is active and comes again it stays one alarm. One
-that ended stays in the list until it is acknowledged where it had held the robot or sent it home. What happens to the
-list goes to ``alarms.jsonl`` in the run directory, a line each, so that a main loop that takes over has the same list.
+An alarm is an active condition of ``ccatp.conditions``, with its name; a condition that repeats remains one alarm. An
+alarm that held the robot or sent it home stays in the list after its end until it is acknowledged. Each event of the
+list is a line of ``alarms.jsonl`` in the run directory, so that a main loop that takes over has the same list.
 """
 
 import time
@@ -21,21 +21,21 @@ from ccatp.core import Severity
 from ccatp.links.topics import Alarm, SeverityName
 
 FILE = "alarms.jsonl"
-# Bounds of the file: an alarm that flutters for hours adds no more lines; the list itself stays right.
+# Bounds of the file, for an alarm that is raised and ended for hours; the list itself stays complete.
 MAX_LINES, MOST_BYTES = 10_000, 1 << 23
-# From here on it is an alarm at once, and an operator has to know of it though it has ended.
+# From this severity on a cause is an alarm at once, and stays in the list until it is acknowledged.
 LASTING = Severity.HOLD
-# What is less grave must last, by the robot's clock or by ours: each run begins with frames that miss something.
+# A less severe cause must last, by the robot's or the host's clock: the first frames of a run always miss something.
 LEAST_S = 1.0
 
 
 def utc_now() -> str:
-    """The time as it stands in the list, UTC."""
+    """The present time in the format of the list, UTC."""
     return datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
 class ActiveCause(NamedTuple):
-    """What is wrong now: name of its condition, the cause as it is shown, and how grave it is."""
+    """An active cause: name of its condition, the text for operators, and its severity."""
 
     name: str
     cause: str
@@ -43,7 +43,7 @@ class ActiveCause(NamedTuple):
 
 
 def active_cause(cause: str) -> ActiveCause:
-    """A cause by its text alone, as grave as its row says; one that no row has is ``other``."""
+    """A cause from its text alone, with the severity of its row; ``other`` if there is no row."""
     row = condition_of(cause)
     return (
         ActiveCause("other", cause, Severity.FAULT) if row is None else ActiveCause(row.name, cause, row.alarm_severity)
@@ -54,7 +54,7 @@ EventName = Literal["raised", "ended", "acknowledged"]
 
 
 class AlarmEvent(msgspec.Struct, frozen=True):
-    """What happened to an alarm, UTC and robot time: ``raised`` (or graver), ``ended``, or ``acknowledged``."""
+    """An event of an alarm, UTC and robot time: ``raised`` (also to a higher severity), ``ended``, ``acknowledged``."""
 
     utc: str
     t_s: float
@@ -69,10 +69,10 @@ _decoder = msgspec.json.Decoder(AlarmEvent)
 
 
 def read_history(run_dir: Path) -> Iterator[AlarmEvent]:
-    """What happened to the alarms of a run, oldest first; a line that was cut off by a kill is left out."""
+    """The events of the alarms of a run, oldest first; a line that was cut off by a kill is left out."""
     try:
         text = read_text(run_dir / FILE, MOST_BYTES)
-    except (OSError, UnicodeDecodeError):  # none yet, or not to be read
+    except (OSError, UnicodeDecodeError):  # there is none yet, or it cannot be read
         return
     for line in text.splitlines():
         with suppress(msgspec.MsgspecError):
@@ -80,14 +80,14 @@ def read_history(run_dir: Path) -> Iterator[AlarmEvent]:
 
 
 class AlarmList:
-    """Raises, ends and acknowledges alarms; ``now`` gives the time that is shown."""
+    """Raises, ends and acknowledges alarms; ``now`` returns the time for the list."""
 
     def __init__(
         self, run_dir: Path, log: structlog.typing.FilteringBoundLogger, now: Callable[[], str] = utc_now
     ) -> None:
         self._path, self._log, self._now = run_dir / FILE, log, now
         self._alarms: dict[str, Alarm] = {}
-        self._since: dict[str, tuple[float, float]] = {}  # robot's clock and ours, of those that are active
+        self._since: dict[str, tuple[float, float]] = {}  # start of the active ones by the robot's and the host's clock
         self._lines = 0
         for event in read_history(run_dir):
             self._lines += 1
@@ -95,11 +95,11 @@ class AlarmList:
 
     @property
     def alarms(self) -> list[Alarm]:
-        """Those that are active, the gravest first, then those that ended and are not acknowledged."""
+        """The active alarms, the most severe first, then those that ended and are not acknowledged."""
         return sorted(self._alarms.values(), key=lambda one: (bool(one.ended), -Severity[one.severity.upper()]))
 
     def update(self, causes: Iterable[ActiveCause], t_s: float) -> None:
-        """Exactly these are active at robot time ``t_s``; what an operator commanded is no alarm."""
+        """Set the active causes at robot time ``t_s``; a command of an operator is no alarm."""
         active: dict[str, tuple[Severity, list[str]]] = {}
         for name, cause, severity in causes:
             if name != OPERATOR.name:
@@ -119,7 +119,7 @@ class AlarmList:
                 self._happened("ended", alarm.name, t_s, alarm.severity, alarm.cause)
 
     def acknowledge(self, name: str, by: str, t_s: float) -> str | None:
-        """An operator has seen an alarm; returns why it was refused, or None. A second time has no effect."""
+        """Acknowledge an alarm; returns why it was refused, or None. A second time has no effect."""
         alarm = self._alarms.get(name)
         if alarm is None:
             known = ", ".join(one.name for one in self.alarms)
@@ -140,7 +140,7 @@ class AlarmList:
         try:
             with self._path.open("ab") as file:
                 file.write(msgspec.json.encode(event) + b"\n")
-        except OSError as error:  # the list in memory holds, and so does the log
+        except OSError as error:  # the list in memory and the log still have it
             self._log.warning("alarm_not_stored", error=str(error))
 
     def _apply(self, event: AlarmEvent) -> None:
@@ -157,7 +157,7 @@ class AlarmList:
             )
             if known is not None and known.ended:
                 alarm.count = known.count + 1
-            elif known is not None:  # it became graver
+            elif known is not None:  # its severity was raised
                 alarm.since, alarm.since_s, alarm.count = known.since, known.since_s, known.count
         elif known is None:
             return

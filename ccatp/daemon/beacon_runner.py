@@ -35,14 +35,14 @@ from ccatp.survey.events import DONE, HELD, IDLE, RETURNING, Fault, MissionState
 if TYPE_CHECKING:
     from ccatp.daemon.main_loop import MainLoop
 
-ECHO_MEMORY = 200  # points that the distance sensors saw lately, for displays
-TRAIL = 400  # places of the robot, one in five frames
+ECHO_MEMORY = 200  # number of recent echoes of the distance sensors, for displays
+TRAIL = 400  # number of places of the robot, one in five frames
 
 
 class BeaconRunner(MissionRunner):
     """A mission among beacons in the main-loop process; nothing of ``cfg.sim`` is used.
 
-    No main loop takes over from it: the map would have to be kept, too.
+    Another main loop cannot take over, because the map is not saved.
     """
 
     mission: BeaconMission
@@ -63,7 +63,7 @@ class BeaconRunner(MissionRunner):
 
     @property
     def is_at_rest(self) -> bool:
-        """The robot is at rest; its wheels obey within a frame, so their last commands count."""
+        """The robot is at rest by its last command, which its wheels reach within a frame."""
         return abs(self._speed_m_s) <= self._cfg.mission.settle_speed_m_s
 
     def status(self) -> MissionStatus:
@@ -82,7 +82,7 @@ class BeaconRunner(MissionRunner):
         )
 
     def display_state(self) -> DisplayState:
-        """The consistency of readings is published with the map, as a sum over many."""
+        """Without the consistency of readings, which is published with the map as a sum over many."""
         belief, telemetry = self.mission.navigator.belief, self.telemetry
         x_m, y_m, xx, xy, yy = belief.ellipse
         return DisplayState(
@@ -104,7 +104,7 @@ class BeaconRunner(MissionRunner):
         check_beacon_robot(self._cfg, hello)
 
     def on_tracking_gap(self) -> None:
-        """A fault: the robot's place is not known, and its map depends on that."""
+        """A fault: the robot's place is not known, and the map depends on it."""
         self._reader.forget()
         self.mission.handle(Fault(FRAMES_MISSED.message))
 
@@ -147,7 +147,7 @@ class BeaconRunner(MissionRunner):
         self._measurements = self._reader.read(frame.sensors, extras)
 
     def plan(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
-        """The mission's velocity, as far as the verdict permits it."""
+        """The drive for the mission's velocity, as far as the verdict permits it."""
         mission = self.mission
         if self._measurements is None:
             raise RuntimeError("plan comes after estimate")
@@ -201,7 +201,7 @@ class BeaconRunner(MissionRunner):
                 self._echoes.append((pose[0] + distance_m * cos(course), pose[1] + distance_m * sin(course)))
 
     def _publish_map(self, seq: int, t_s: float) -> None:
-        """Publish the map, and the same as a scene for displays."""
+        """Publish the map, also as a scene for displays."""
         cfg, mission = self._cfg, self.mission
         navigator = mission.navigator
         belief, beacons = navigator.belief, dict(navigator.beacons)

@@ -1,4 +1,4 @@
-"""Checkpoint of a main loop, and its parts and database: new, resumed, or taken over."""
+"""Builds the parts and the database of a main loop: new, resumed, or taken over from a checkpoint."""
 
 from collections.abc import Collection, Sequence
 
@@ -20,7 +20,7 @@ from ccatp.survey.planning.route import ORDERS
 
 
 class StoreUnusable(CcatpError):
-    """The mission's database cannot be made or read."""
+    """The mission's database cannot be created or read."""
 
     exit_status = ExitStatus.USAGE
 

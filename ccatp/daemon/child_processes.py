@@ -22,18 +22,18 @@ from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import Heartbeat
 from ccatp.report.dashboard.access import TOKEN_FILE
 
-# The process has reported why, and a restart would end alike.
+# Exit statuses after which a restart would end in the same way; the process has reported the reason.
 FINAL = (ExitStatus.USAGE, ExitStatus.UNREACHABLE)
-# As POSIX and Linux number them; what kills processes here.
+# Signals that kill processes, with their numbers in POSIX and Linux.
 _SIGNALS = {2: "SIGINT", 3: "SIGQUIT", 6: "SIGABRT", 7: "SIGBUS", 9: "SIGKILL", 11: "SIGSEGV", 15: "SIGTERM"}
-# Of a longer time between two polls the supervisor was itself held up and received nothing.
+# In a longer time between two polls the supervisor itself was blocked and received nothing.
 MAX_POLL_GAP_S = 0.2
 # The matrices are 4 x 4: threads of the linear algebra would only compete with the processes for the cores.
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 STOP_TIMEOUT_S = 4.0
-# Each process has this long, even where others have used up the time.
+# Each process has at least this time to stop, even if others have used up the deadline.
 LEAST_STOP_S = 1.0
-# A loop that was restarted joins within this.
+# A restarted loop joins the robot within this time.
 RECOVERY_S = 5.0
 
 
@@ -43,13 +43,13 @@ class ProcessSpec:
 
     name: str
     module: str  # run with ``python -m``
-    is_simulator: bool = False  # runs with ``--sim`` only
+    is_simulator: bool = False  # runs only with ``--sim``
     listens: str = ""  # section with host and port of its listening socket, which the supervisor binds
     is_replaceable: bool = True  # can be restarted when it dies; the simulated robot cannot
-    is_loop: bool = False  # publishes a heartbeat, and hangs when it does not
-    is_needed: bool = True  # the survey does not go on without it
+    is_loop: bool = False  # publishes a heartbeat; without it, the process hangs
+    is_needed: bool = True  # the survey cannot continue without it
     niceness: int = 0
-    hang_timeout_s: float | None = None  # where it is not ``run.hang_timeout_s``
+    hang_timeout_s: float | None = None  # None: ``run.hang_timeout_s``
 
 
 class ProcessEnd(Enum):
@@ -58,18 +58,18 @@ class ProcessEnd(Enum):
     RESTART = "restart"
     END = "end"  # with the status of the process
     HELD = "held"  # with status 4
-    WITHOUT = "without"  # it goes on without the process
+    WITHOUT = "without"  # the run continues without the process
 
 
 class RestartPolicy:
-    """Decides on the processes of one run; each may be restarted ``limit`` times within ``window_s``."""
+    """Decides on restarts in one run; each process may be restarted ``limit`` times within ``window_s``."""
 
     def __init__(self, limit: int, window_s: float) -> None:
         self._limit, self._window_s = limit, window_s
         self._restarts_s: defaultdict[str, deque[float]] = defaultdict(deque)
 
     def died(self, spec: ProcessSpec, code: int, now_s: float, why: str = "") -> tuple[ProcessEnd, str]:
-        """A process has died with exit status ``code``, or minus the number of the signal that killed it.
+        """Decide after the death of a process; ``code``: exit status, or minus the number of the killing signal.
 
         Returns the consequence for the run, and a line for the operator.
         """
@@ -91,7 +91,7 @@ class RestartPolicy:
 
 
 class SilenceWatch:
-    """Time since the last heartbeat of a process, as far as the supervisor was able to receive."""
+    """Time since the last heartbeat of a process, without the time in which the supervisor was blocked."""
 
     def __init__(self, start_timeout_s: float, hang_timeout_s: float) -> None:
         self._limit_s, self._hang_timeout_s = start_timeout_s, hang_timeout_s
@@ -103,7 +103,7 @@ class SilenceWatch:
         self._limit_s, self._silent_s = self._hang_timeout_s, 0.0
 
     def is_hung(self, now_s: float) -> bool:
-        """Poll. Time in which the supervisor itself stood still does not count."""
+        """Poll: whether the process has been silent for too long."""
         if self._polled_s is not None:
             self._silent_s += min(max(now_s - self._polled_s, 0.0), MAX_POLL_GAP_S)
         self._polled_s = now_s
@@ -144,13 +144,13 @@ class ProcessManager:
         self.restarts = 0
 
     def is_recovering(self, now_s: float) -> bool:
-        """Whether one was restarted a short while ago."""
+        """Whether a process was restarted a short time ago."""
         return now_s < self._is_recovering_until_s
 
     def start(self, spec: ProcessSpec, *, is_restarted: bool = False) -> None:
-        """Start one."""
+        """Start a process."""
         arguments, fds = self._command_of(spec, is_restarted)
-        # Their own session: a Ctrl-C in the terminal reaches the supervisor alone, which stops them in order.
+        # In its own session, so that Ctrl-C in the terminal reaches only the supervisor, which stops all in order.
         process = subprocess.Popen(
             [sys.executable, "-m", spec.module, *arguments],
             stdin=subprocess.DEVNULL,
@@ -159,15 +159,16 @@ class ProcessManager:
             start_new_session=True,
             env={**child_environment(os.environ), **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
         )
-        # From outside, so that it holds before the process has read its first module. Our own may be another by now.
-        with suppress(OSError):  # it has ended already, or we may not give it more than we have
+        # Set from here, so that it applies before the process loads its first module, and not relative to the present
+        # niceness of the supervisor, which may have changed.
+        with suppress(OSError):  # it has ended already, or we may not raise its priority
             os.setpriority(os.PRIO_PROCESS, process.pid, self._niceness + spec.niceness)
         hang_timeout_s = spec.hang_timeout_s or self._cfg.hang_timeout_s
         watch = SilenceWatch(max(self._cfg.start_timeout_s, hang_timeout_s), hang_timeout_s) if spec.is_loop else None
         self._children[spec.name] = _Child(spec, process, watch)
 
     def on_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """A heartbeat was received; that of a dead process does not count."""
+        """Take a heartbeat; that of a dead process has no effect."""
         child = self._children.get(heartbeat.process)
         if child is not None and child.watch is not None and child.process.pid == heartbeat.pid:
             child.watch.reset()
@@ -175,14 +176,14 @@ class ProcessManager:
     def poll(self, now_s: float) -> tuple[str, int, ProcessEnd, str] | None:
         """Collect dead processes, kill hung ones, and restart.
 
-        Returns the process that ends the run, with its exit code, how, and a line for the operator; or ``None``.
+        Returns the process that ends the run, its exit code, the consequence, and a line for the operator; or ``None``.
         """
         for name, child in tuple(self._children.items()):
             spec, code = child.spec, child.process.poll()
             if code is None:
                 if child.watch is not None and not child.why_killed and child.watch.is_hung(now_s):
                     child.why_killed = child.watch.text
-                    child.process.kill()  # ends also a stopped process, which is found dead by the next poll
+                    child.process.kill()  # also ends a stopped process; the next poll finds it dead
                 continue
             end, text = self._policy.died(spec, code, now_s, child.why_killed)
             if end in (ProcessEnd.END, ProcessEnd.HELD):
@@ -198,10 +199,10 @@ class ProcessManager:
         return None
 
     def stop_all(self) -> None:
-        """Ask each to end, with a deadline for all: the loops one by one, main first, then the servers together.
+        """Terminate all, with a common deadline: the loops one by one, main first, then the servers together.
 
-        What the survey does not need, and so has nothing to save, is asked as soon as the first has ended, and killed
-        where it is still there at the end.
+        A process that the survey does not need has nothing to save. It is terminated after the first loop has ended,
+        and killed if it still runs at the end.
         """
         deadline_s = time.monotonic() + STOP_TIMEOUT_S
         running = [child for child in reversed(self._children.values()) if child.process.poll() is None]
@@ -232,7 +233,7 @@ class ProcessManager:
             child.process.wait()
 
     def kill_all(self) -> None:
-        """Kill every process that is left."""
+        """Kill every process that still runs."""
         for child in self._children.values():
             if child.process.poll() is None:
                 child.process.kill()
@@ -240,7 +241,7 @@ class ProcessManager:
 
 
 def listen(section: str, host: str, port: int) -> socket.socket:
-    """A listening socket for a process that inherits it; port 0 takes any free one. ConfigError: it is taken."""
+    """A listening socket for a process that inherits it; port 0 takes any free one. ConfigError: it is in use."""
     try:
         return listen_at(host, port)
     except OSError as error:
@@ -251,7 +252,7 @@ def listen(section: str, host: str, port: int) -> socket.socket:
 
 
 class PageSocket(NamedTuple):
-    """The listening socket, ``None`` without a dashboard, and the message for the operator, which may be empty."""
+    """The listening socket (``None`` without a dashboard) and the message for the operator, which may be empty."""
 
     socket: socket.socket | None
     config: DashboardConfig
@@ -260,7 +261,7 @@ class PageSocket(NamedTuple):
 
 
 def open_page_socket(cfg: DashboardConfig) -> PageSocket:
-    """Listen at the configured address, or at another port if that one is in use; a survey runs without a page, too."""
+    """Listen at the configured address, or at another port if that is in use. A failure does not stop the survey."""
     if not cfg.enabled:
         return PageSocket(None, cfg, "info", "")
     level, before = "info", "dashboard: "
@@ -286,9 +287,9 @@ def page_url(host: str, port: int) -> str:
 
 
 def token_query(cfg: DashboardConfig, runtime_dir: Path) -> str:
-    """What an operator appends to the page's address to command from it: the token of this start; never to be logged.
+    """The query with the token of this start, which permits commands from the page; it must not be logged.
 
-    Empty where tokens are configured: each operator has one.
+    Empty if tokens are configured, because each operator has one.
     """
     if cfg.token_file:
         return ""
@@ -298,7 +299,7 @@ def token_query(cfg: DashboardConfig, runtime_dir: Path) -> str:
 
 
 def page_address(runtime_dir: Path) -> str:
-    """Address of the page of a daemon, as its operator opens it; empty where no page is in the runtime directory."""
+    """Address of a daemon's page with its token; empty if there is no page in the runtime directory."""
     run_dir = run_dir_in(runtime_dir)
     if run_dir is None or not (runtime_dir / "dashboard").exists():
         return ""
@@ -321,9 +322,9 @@ C = TypeVar("C", bound=Config | RadioConfig)
 
 
 def with_addresses(cfg: C, sockets: Mapping[str, socket.socket]) -> C:
-    """The configuration of the clients of the simulated servers.
+    """The configuration with the addresses of the simulated servers for their clients.
 
-    What is asked for in ``sim`` stays: a run that is resumed with port 0 takes any free one again.
+    The section ``sim`` stays as it is, so that a resumed run with port 0 takes any free port again.
     """
     changes: dict[str, object] = {}
     for process, section, _ in simulated_servers(cfg):

@@ -58,10 +58,9 @@ SUMMARISED = {"mission", "track", "truth", "arrival", "fix", "danger_event"}
 
 
 class Collector:
-    """Receives a run's messages: records and shows them, and has the summary built from them.
+    """Receives a run's messages: records and shows them, and collects the summary.
 
-    Attributes:
-        status: progress of the mission, once main has published it.
+    ``status``: progress of the mission, ``None`` before main has published it.
     """
 
     def __init__(
@@ -111,7 +110,7 @@ class Collector:
         return self._record.remarks if isinstance(self._record, SurveyRecord) else []
 
     def finish(self) -> None:
-        """Request the last rows of the simulated truth, and wait for messages on their way."""
+        """Request the last rows of the simulated truth, and wait for the messages that are still on their way."""
         if self._is_sim:
             rows = int(self._request(b"flush").get("rows", 0))
             if isinstance(self._record, SurveyRecord):
@@ -123,7 +122,7 @@ class Collector:
         self.collect(1)
 
     def summary(self, wall_s: float) -> dict[str, Any]:
-        """``summary.json``; call it when main has closed the mission's database."""
+        """Content of ``summary.json``; call it after main has closed the mission's database."""
         return self._record.build(wall_s)
 
     def __enter__(self) -> Self:
@@ -135,12 +134,12 @@ class Collector:
 
     @property
     def is_over(self) -> bool:
-        """Main has published how the mission ended."""
+        """Main has published the end of the mission."""
         return self.status is not None and self.status.exit_status >= 0
 
     @property
     def exit_status(self) -> ExitStatus:
-        """Exit status of the run by main."""
+        """Exit status of the run from main."""
         return ExitStatus(self.status.exit_status) if self.status is not None else ExitStatus.HELD
 
     def collect(self, timeout_ms: int, view: RunView | None = None, limit: int = sys.maxsize) -> None:
@@ -176,7 +175,7 @@ class Collector:
         try:
             for shown in self._views.of(message):
                 self._recorder.write(*shown)
-        except Exception as error:  # the raw topics hold all of it
+        except Exception as error:  # the raw topics have all the data
             self._views = None
             self._on_recorder_failure(f"views for Foxglove and PlotJuggler: {type(error).__name__}: {error}")
 
@@ -185,7 +184,7 @@ class Collector:
             self._view.show_message("error", f"{reason}; the survey goes on")
 
     def _request(self, request: bytes) -> dict[str, Any]:
-        """Reply of the simulated truth; empty where it is gone, so that everything that it published has arrived."""
+        """Reply of the simulated truth; empty if it has ended, when all its messages have arrived."""
         with self._context.socket(zmq.REQ) as peer:
             peer.setsockopt(zmq.LINGER, 0)
             peer.connect(self._endpoints.of("puck"))
@@ -221,14 +220,14 @@ class _SurveySession:
                 builder.add_verdict_event(message.seq, message.code)
             self._code = message.code
         elif isinstance(message, MissionStatus):
-            if not self.has_status:  # a main loop that takes over plans what is left
+            if not self.has_status:  # only the first: a main loop that takes over plans only the rest
                 self.has_status = True
                 builder.set_plan(message.total, message.lower_bound_s)
             builder.set_mission(message.done, message.skipped, message.elapsed_s, message.left_out)
             builder.add_grip(message.friction, message.grip)
 
     def _on_deck(self, track: TrackMessage) -> FloatArray:
-        """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""
+        """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, in the format of the truth."""
         rows = np.array(track.rows)
         deck = deck_rows(self._mirror, [row[2:4] for row in track.rows], rows[:, 4:7])
         return np.column_stack([rows[:, :2], deck[:, :3], deck[:, :2], deck[:, 3]])
@@ -246,19 +245,19 @@ class SurveyRecord:
         self.remarks: list[str] = []
 
     def set_injected(self, rows: list[list[float]]) -> None:
-        """How the simulated panels really lie, rows as of ``Misalignment``."""
+        """Set the true misalignment of the simulated panels: rows of row, column, piston, tip, tilt."""
         self._injected = {PanelId(int(row), int(col)): (piston, tip, tilt) for row, col, piston, tip, tilt in rows}
 
     def build(self, wall_s: float) -> dict[str, Any]:
-        """The summary, when main has closed the mission's database."""
+        """The summary, after main has closed the mission's database."""
         survey = self._stored()
         standings = [] if survey is None else [point.status for point in survey.points]
         if not self._session.has_status:
             if survey is None and (before := _read(self._run_dir / "summary.json")):
-                return before  # nothing is known, and that must not replace an earlier summary
+                return before  # keep the earlier summary, because nothing is known of this session
             self.take(MissionStatus(seq=-1, t_s=0.0, state="", total=len(standings)))
         builder = self._session.builder
-        if survey is not None:  # the last status of a main that was told to end may be lost
+        if survey is not None:  # the last status of a main that was terminated may be lost
             builder.set_counts(standings.count("measured"), standings.count("skipped"))
         builder.set_panels({} if survey is None else self._fits(survey), self._injected)
         for path in reversed(recordings(self._run_dir / TELEMETRY)[:-1]):
@@ -272,10 +271,10 @@ class SurveyRecord:
 
     def _stored(self) -> StoredSurvey | None:
         path = self._run_dir / "mission.sqlite"
-        if not path.exists():  # main ended before it made one
+        if not path.exists():  # main ended before it created one
             return None
         try:
-            return read_survey(path, self.mirror.name)  # it needs no room on the disk
+            return read_survey(path, self.mirror.name)  # works on a full disk, too
         except StoreError as error:
             self.remarks.append(f"the summary is without panels: {error}")
             return None

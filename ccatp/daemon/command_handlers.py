@@ -1,4 +1,4 @@
-"""The observatory channel: a unix socket, and TCP for listed clients. Its requests are applied to the danger rules."""
+"""The observatory channel: a unix socket, and TCP for listed clients; its requests go to the danger rules."""
 
 import asyncio
 import time
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from ccatp.safety.beacons import BeaconSafetyRules
 
 KEY_FILE, CLIENTS_FILE = "observatory.key_file", "observatory.clients_file"
-# Access to the unix socket takes the daemon's own user, who might as well stop the daemon.
+# Only the daemon's own user can use the unix socket, and this user could also stop the daemon.
 LOCAL = AuthorizedClient("local", "clear")
-# Repeated requests must not fill the log.
+# Limits the log lines of repeated requests.
 LOGGED_LINES, LOGGED_PERIOD_S = 10, 60.0
 
 
@@ -50,7 +50,7 @@ class ObservatoryServer:
         self._refused = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
 
     async def serve(self, context: zmq.asyncio.Context) -> None:
-        """Bind, and answer until cancelled; raises ``RouterError`` where an endpoint cannot be bound."""
+        """Bind, and answer until cancelled. Raises ``RouterError`` if an endpoint cannot be bound."""
         async with AsyncExitStack() as stack:
             local = await stack.enter_async_context(Router(self._local_endpoint, self.answer, context))
             work = [local.serve()]
@@ -80,7 +80,7 @@ class ObservatoryServer:
         return reply
 
     def _answer_remote(self, frame: bytes, user_id: str) -> bytes:
-        """A client that is taken off the list loses its rights at once, connected or not."""
+        """A client that was removed from the list loses its rights at once, even if it is connected."""
         client = self._clients.clients.get(user_id)
         if client is None:
             self._log_unknown(f"key {user_id} is not on the list any more")
@@ -97,10 +97,7 @@ class ObservatoryServer:
 
 
 def check_observatory(cfg: ObservatoryConfig) -> KeyPair | None:
-    """The server's keys, ``None`` where TCP is not configured.
-
-    ConfigError: the keys or the list of clients cannot be used.
-    """
+    """The server's keys, ``None`` without TCP. ConfigError: the keys or the list of clients cannot be used."""
     if not cfg.endpoint:
         return None
     read_clients(Path(cfg.clients_file), CLIENTS_FILE)

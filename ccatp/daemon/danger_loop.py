@@ -1,7 +1,6 @@
-"""The danger-loop process: judges every sensors frame and publishes permit and verdict.
+"""The danger-loop process: judges every sensors frame, and sends the permit and the verdict.
 
-The safety monitor follows from the configuration. The emergency latch is kept in a file, so that a restarted process
-has the emergencies of the one before.
+The configuration selects the safety monitor. The emergency latch is saved in a file for a restarted process.
 """
 
 import asyncio
@@ -41,7 +40,7 @@ Judge = Callable[[Sensors, bytes, EstimateMessage | None], Verdict]
 
 
 def build_safety_monitor(cfg: Config | RadioConfig) -> tuple[DangerMonitor | BeaconSafetyRules, Judge]:
-    """The rules that go with a configuration, and the verdict on a frame, its line and main's newest estimate."""
+    """The safety monitor of a configuration, and the function that judges a frame, its line and main's estimate."""
     if isinstance(cfg, RadioConfig):
         rules = BeaconSafetyRules(cfg)
 
@@ -49,7 +48,7 @@ def build_safety_monitor(cfg: Config | RadioConfig) -> tuple[DangerMonitor | Bea
             try:
                 extras = decode_beacon_frame(raw)
             except BadLine:
-                # Without its distances the way ahead is not known.
+                # Without the distances, obstacles are not known.
                 return rules.stale(sensors.seq, sensors.t)
             return rules.step(sensors, extras, estimate)
 
@@ -59,12 +58,12 @@ def build_safety_monitor(cfg: Config | RadioConfig) -> tuple[DangerMonitor | Bea
 
 
 FILE = "emergencies.json"
-# A latch of some hundred emergencies, and as many that were cleared.
+# Enough for some hundred active emergencies and as many cleared ones.
 RESERVE_BYTES = 65536
 
 
 def active_ids(path: Path) -> list[str]:
-    """The ids of the emergencies in a file, as far as it can be read."""
+    """The ids of the active emergencies in a file; empty if it cannot be read."""
     try:
         return [str(e["id"]) for e in json.loads(read_text(path))["active"]]
     except (OSError, ValueError, KeyError, TypeError):
@@ -72,9 +71,9 @@ def active_ids(path: Path) -> list[str]:
 
 
 class PersistentEmergencyLatch(EmergencyLatch):
-    """A latch that is on the disk before it is acknowledged.
+    """A latch that is on the disk before the reply is sent.
 
-    An existing file is read. Where the file cannot be read or written, this is logged, and the latch holds as before.
+    An existing file is read. A failure to read or write is logged; the latch in memory remains valid.
     """
 
     def __init__(self, path: Path, log: structlog.typing.FilteringBoundLogger) -> None:
@@ -91,7 +90,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
         except FileNotFoundError:
             return
         except (OSError, ValueError, KeyError, TypeError) as error:
-            # Its content is not known: the survey is aborted rather than continued.
+            # The content is not known, so the survey is aborted, to be safe.
             unknown = str(uuid.uuid4())
             advice = f"taken for an emergency; 'ccatp clear {unknown}' ends it"
             log.error("emergencies_unreadable", path=str(path), error=str(error), advice=advice)
@@ -135,7 +134,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
             self._reserve()
 
     def _reserve(self) -> None:
-        """Room for the next state, taken while there is some: an emergency is kept though the disk is full."""
+        """Reserve space for the next state, so that an emergency can be saved on a full disk."""
         with self._new.open("ab") as file:
             os.posix_fallocate(file.fileno(), 0, RESERVE_BYTES)
 
@@ -160,7 +159,7 @@ class DangerLoop(RobotLoop):
         )
         self._seq, self._t_s = -1, 0.0
         self._bad_lines = self._permit_seq = 0
-        self._sent: tuple[int, Verdict] | None = None  # newest permit of the session, and its frame
+        self._sent: tuple[int, Verdict] | None = None  # frame and verdict of the last permit of the session
         self._is_stale = False
         self._observatory = ObservatoryServer(
             args.endpoints.of("emergency"),
@@ -174,7 +173,7 @@ class DangerLoop(RobotLoop):
         return self._observatory.serve(self._shadow), self.publish_heartbeat(), self.watch(), self.serve()
 
     def is_peer_ready(self) -> bool:
-        """Messages get through, both ways: the first ones must not be lost."""
+        """Whether messages arrive in both directions, so that the first ones are not lost."""
         self._has_estimate = self._has_estimate or self._estimates.has_received()
         return self._has_estimate and self.publisher.has_subscriber("verdict")
 
@@ -206,7 +205,7 @@ class DangerLoop(RobotLoop):
         self._publish_verdict(self.monitor.stale(self._seq, self._t_s), self._seq)
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
-        """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
+        """Judge one frame. In lockstep it waits for main's estimate of a certain frame, so that a run is repeatable."""
         is_lockstep = self.is_lockstep
         self._seq, self._t_s, self.heartbeat.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         self._bad_lines = 0
@@ -214,17 +213,17 @@ class DangerLoop(RobotLoop):
         try:
             verdict = self._judge(sensors, raw, estimate)
         except Exception as error:
-            # Without a verdict the robot's permit runs out: it holds by itself.
+            # Without a verdict the robot's permit expires, and the robot holds by itself.
             self.log.exception("unhandled_exception", seq=self._seq)
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             self.over.set()
             return
         if not is_lockstep and self.lateness.add(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
-            verdict = self.monitor.stale(sensors.seq, sensors.t)  # a verdict on the past: no permit for the present
+            verdict = self.monitor.stale(sensors.seq, sensors.t)  # too late: this verdict would be on an old frame
         self._publish_verdict(verdict, sensors.seq)
 
     def on_bad_line(self) -> None:
-        """In lockstep each stands for a frame's time, so that the run is repeatable."""
+        """In lockstep each bad line counts as the period of a frame, so that a run is repeatable."""
         super().on_bad_line()
         self._bad_lines += 1
         hello = self.hello
@@ -244,11 +243,11 @@ class DangerLoop(RobotLoop):
         self.log.warning("frame_overdue", text=text)
 
     def _publish_verdict(self, verdict: Verdict, ack: int) -> None:
-        if ack >= 0:  # the robot first: the permit does not wait for the publication
+        if ack >= 0:  # the permit first, without waiting for the publication
             self._sent = ack, verdict
             self.answer_again()
         self.publisher.send("verdict", verdict)
-        if not (verdict.cause or self._published[1]):  # all is well, as before: whatever is found gives a cause
+        if not (verdict.cause or self._published[1]):  # still no cause, so there is no finding either
             return
         found, emergencies = self.monitor.found, self.monitor.latch.causes
         names = frozenset((*(finding.condition.name for finding in found), *emergencies))

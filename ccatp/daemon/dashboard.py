@@ -1,6 +1,6 @@
-"""The dashboard process: of a run, at a socket that the supervisor has bound, or beside a daemon (``ccatp dashboard``).
+"""The dashboard process: started by the supervisor of a run, or separately (``ccatp dashboard``).
 
-The supervisor binds the socket, so that a restarted dashboard has the same address.
+The supervisor binds the socket of the former, so that a restarted dashboard has the same address.
 """
 
 import asyncio
@@ -53,10 +53,10 @@ async def serve_page(
     is_sim: bool,
     has_heartbeat: bool,
 ) -> None:
-    """Serve a dashboard until ``stop`` is set and the open pages have got the last state.
+    """Serve a dashboard until ``stop`` is set and the open pages have received the last state.
 
-    What was before is read in ``run_dir``: points in the database, path and plots in the recording. ConfigError: the
-    tokens cannot be read.
+    The past of the run is read from ``run_dir``: points from the database, path and plots from the recording.
+    ConfigError: the tokens cannot be read.
     """
     settings, is_over = cfg.dashboard, asyncio.Event()
     tokens = page_tokens(settings, endpoints.runtime_dir)
@@ -158,7 +158,7 @@ def main() -> int:
 
 
 def attach(runtime_dir: Path | None, settings: Mapping[str, object], report: Callable[[str], None]) -> int:
-    """Serve a dashboard beside a running daemon until SIGINT or SIGTERM; ``settings`` replace keys of ``dashboard``.
+    """Serve a dashboard for a running daemon until SIGINT or SIGTERM; ``settings`` replace keys of ``dashboard``.
 
     DaemonUnreachableError: no daemon runs in the runtime directory; ConfigError: a key outside ``dashboard``, a token
     that cannot be read, or no address to listen on.

@@ -1,4 +1,4 @@
-"""One measurement at a time: laser system, fix gate, localizer, store, mission."""
+"""Takes one measurement at a time: laser system, fix gate, localizer, store, mission."""
 
 import asyncio
 from collections.abc import Callable
@@ -20,22 +20,22 @@ from ccatp.survey.events import Fault, FixFailed, FixStored, PointMissed
 from ccatp.survey.fix_gate import ApproachCounter, FixGate
 from ccatp.survey.statechart import Mission
 
-# A commit takes milliseconds, on a busy disk a second. A longer one is reported, a much longer one holds the robot.
+# A commit takes milliseconds, or a second on a busy disk. After these times it is reported, then holds the robot.
 SLOW_DISK_S = 2.0
 STALLED_DISK_S = 30.0
-# Between two questions whether the lasers are warm, and between two reports that they are not.
+# Periods of the requests whether the lasers are warm, and of the reports that they are not.
 LASER_PERIOD_S, LASER_REPORT_S = 1.0, 60.0
-# A doubtful fix is measured again this often.
+# Number of repeated measurements of a doubtful fix.
 REPEATS = 2
 
 
 class FrameRefused(EtalonError):
-    """The laser system measures in another frame or unit than ours: it is of no use for this mission."""
+    """The laser system measures in another frame or unit, and cannot be used in this mission."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixRequest:
-    """One measurement: of a point, or (``None``) to localize the robot; ``number`` is the mission's."""
+    """One measurement: of a point, or (``None``) to localize the robot; ``number``: of the mission's request."""
 
     number: int
     t_s: float
@@ -77,7 +77,7 @@ class FixService:
         self.wait_cause = ""  # what the measurement waits for, or empty
 
     def begin(self, request: FixRequest) -> None:
-        """Take a measurement; one in progress is finished first, and dropped."""
+        """Take a measurement; one in progress is finished first, and its result is dropped."""
         self.is_busy = True
         self._wanted = request
         self._wakes.set()
@@ -95,12 +95,12 @@ class FixService:
                 self._on_finished()
 
     def _is_wanted(self, request: FixRequest) -> bool:
-        """Not after a pause or an edge: the robot may have moved."""
+        """Whether the mission still waits for it; not after a pause or an edge, because the robot may have moved."""
         state = self._mission.state
         return state.is_awaiting_fix and state.request == request.number
 
     async def _serve(self, request: FixRequest) -> None:
-        """Measure, again where the fix is doubted, all within the time that a point may take."""
+        """Measure, and repeat a doubtful fix, within the time limit of a point."""
         self._fix_gate.begin()
         try:
             await self._await_laser(request)
@@ -121,7 +121,7 @@ class FixService:
             await self._store_fix(request, fix)
 
     async def _await_laser(self, request: FixRequest) -> None:
-        """Wait until the lasers are warm, or the fix is not wanted any more; reported at once and each minute."""
+        """Wait until the lasers are warm or the fix is not wanted any more; report this at once and each minute."""
         clock, reported_s = asyncio.get_running_loop().time, -inf
         try:
             while self._is_wanted(request) and not await self._client.is_laser_ready():
@@ -134,12 +134,12 @@ class FixService:
             self.wait_cause = ""
 
     async def _measure(self, request: FixRequest) -> tuple[Fix, str]:
-        """One fix, handed to the localizer if it is still wanted, and why it is doubted."""
+        """Measure a fix, and fuse it if it is still wanted; returns it, and why it is doubted or an empty text."""
         fix = await self._client.measure(request.t_s, request.expected_m)
         return fix, self._fuse(request, fix) if self._is_wanted(request) else ""
 
     def _fuse(self, request: FixRequest, fix: Fix) -> str:
-        """Hand a fix to the localizer, unless it is doubted; why it is, or empty."""
+        """Fuse a fix unless it is doubted; returns the reason, or an empty text."""
         localizer = self._localizer
         finding = self._fix_gate.review(
             fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.state.is_lost
@@ -195,7 +195,7 @@ class FixService:
         self._mission.handle(FixFailed(request.point, cause, self._heading_sigma_of()))
 
     async def _store_fix(self, request: FixRequest, fix: Fix) -> None:
-        """The localizer has taken the fix: store it where the robot is near enough to the point."""
+        """Store a fused fix if the robot is near enough to the point."""
         if request.point is not None:
             mission = self._mission
             self.arrival_error_m = mission.survey.follower.distance_m(mission.state.stop, self._localizer.pose)
@@ -205,17 +205,14 @@ class FixService:
             try:
                 await self._await_commit(self._store.record_fix(request.point, fix, request.estimate), request.point)
             except AlreadyMeasuredError as error:
-                self._notify("warning", str(error))  # nothing is lost, and nothing has to be waited for
+                self._notify("warning", str(error))  # the point is stored already
             except StoreError as error:
                 mission.handle(Fault(FIX_NOT_STORED.text(point=_name(request.point), why=error)))
                 return
         self._mission.handle(FixStored(request.point, self._heading_sigma_of()))
 
     async def _await_commit(self, commit: "Future[Any]", point: PointId) -> None:
-        """Wait for a commit. On a disk that stalls the robot stands here, and after a while is held for an operator.
-
-        StoreError: it will not be committed.
-        """
+        """Wait for a commit while the robot stands; after ``STALLED_DISK_S`` it is a fault. StoreError: it failed."""
         waiting = asyncio.wrap_future(commit)
         try:
             await asyncio.wait([waiting], timeout=SLOW_DISK_S)
@@ -230,7 +227,7 @@ class FixService:
             waiting.cancel()
 
     def _is_too_far(self, point: PointId) -> bool:
-        """Whether the point has to be approached again: what was measured there is not its alignment."""
+        """Whether the point has to be approached again, because the robot stands too far from it."""
         is_too_far = self._approaches.is_too_far(point, self.arrival_error_m, self._localizer.position_sigma_m)
         what = f"{1e3 * self.arrival_error_m:.2f} mm from {_name(point)}"
         if is_too_far:

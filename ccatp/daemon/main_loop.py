@@ -34,25 +34,25 @@ from ccatp.links.topics import ESTIMATE_FRAMES, DangerEvent, MissionStatus
 from ccatp.safety.escalation import Since
 from ccatp.survey.events import HELD, Abort, Fault, Interrupted, Pause, Resume, StopHere
 
-# After the end the last messages must reach the supervisor, which then ends this process: reported if it takes longer.
+# The supervisor ends this process after it has received the last messages; a longer wait is reported.
 SHUTDOWN_REPORT_S = 30.0
-# Of the levels one display state goes to those who keep a history, where no page asks for all of them.
+# Without an open page, one display state in so many levels is published, for recordings.
 SAMPLED_LEVELS = 10
-# The place of a robot that moved is not known when the samples of more frames than this are missing.
+# Without samples for longer than this, the place of a moving robot is not known.
 UNSEEN_S = 0.1
-# The frames that come while a path is planned for a robot that stands are late for a reason, and served within this.
+# Frames that arrive while a path is planned for a standing robot are late; they are served within this time.
 CATCH_UP_S = 0.5
-# A robot at 0.1 m/s is at rest within half a second; a command that took no effect by then has failed.
+# A robot at 0.1 m/s is at rest within half a second; a command without effect after this time has failed.
 EFFECT_TIMEOUT_S = 5.0
 
 
-# A robot that stands for longer is reported, with the reason and what to do, and again after each minute.
+# A robot that stands for longer is reported, with reason and advice, and again after each minute.
 STANDS_REPORT_S, STANDS_REPEAT_S = 30.0, 60.0
 
 
-# Causes of a pause that only this loop knows, so that none of danger's monitors counts how long it lasts.
+# Causes of a pause that only this loop finds, so that it measures their duration itself.
 OWN_PAUSES = FRAME_LATE, FRAMES_OLD, NO_VERDICT
-# Of a mission among beacons; its map does not outlive a gap, so that there is no hold before a fault.
+# For a mission among beacons, which cannot relocalize: its pause becomes a fault without a hold before.
 BEACON_PAUSE_LIMITS_S = inf, 30.0
 
 
@@ -65,14 +65,14 @@ COMMANDS: dict[OperatorCommand, Pause | Resume | Abort | StopHere] = {
 
 
 class StandstillReport:
-    """When to report that the robot stands: after ``STANDS_REPORT_S``, and again after each ``STANDS_REPEAT_S``."""
+    """Decides when to report a standing robot: after ``STANDS_REPORT_S``, and after each ``STANDS_REPEAT_S``."""
 
     def __init__(self) -> None:
         self._since_s: float | None = None
         self._due_s = inf
 
     def lasts_s(self, now_s: float, *, stands: bool) -> float | None:
-        """How long it stands, where that is to be reported now."""
+        """Duration of the standstill if a report is due, else ``None``."""
         if not stands:
             self._since_s = None
             return None
@@ -91,12 +91,9 @@ class UnhandledError(CcatpError):
 
 
 class MainLoop(RobotLoop):
-    """The process around its mission: frames, clock, commands, beginning and end.
+    """The main loop of a mission: frames, clock, commands, start and end.
 
-    Attributes:
-        clock: of the frames.
-        frame_period_s: time between two frames of the present session.
-        exit_status: of the process.
+    ``frame_period_s``: of the present session.
     """
 
     def __init__(
@@ -112,7 +109,7 @@ class MainLoop(RobotLoop):
         self.clock = MissionClock(10.0 * cfg.run.step_s if isinstance(cfg, RadioConfig) else cfg.health.clock_jump_s)
         self.frame_period_s = 0.0
         self._is_new_session, self._drive_seq = False, 0
-        self._sent: tuple[int, DriveCommand] | None = None  # newest drive of the session, and its frame
+        self._sent: tuple[int, DriveCommand] | None = None  # frame and command of the last drive of the session
         self._catches_up_until_s = -inf
         self._was_at_rest = False
         self._levels_sent = 0
@@ -124,7 +121,7 @@ class MainLoop(RobotLoop):
         self._own_pause, self._has_gap = Since(), False
         self.exit_status = ExitStatus.INTERRUPTED
         self.alarms = AlarmList(args.run_dir, self.log)
-        # Apart from the verdicts, which are read with the frames: what danger finds is reported without frames, too.
+        # Separate from the verdicts, which are read with the frames, because findings are reported without frames, too.
         self._danger_events = Subscriber(context, [danger], ["danger_event"], is_uncounted=True)
         self._danger_active: list[ActiveCause] = []
         self._runner = make_runner(self)
@@ -133,7 +130,7 @@ class MainLoop(RobotLoop):
     def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
         return self._serve_operator(), self.publish_heartbeat(), self._runner.run(), self.serve(), self.watch()
 
-    # -- beginning and end ----------------------------------------------------------------------------------------
+    # -- start and end --------------------------------------------------------------------------------------------
 
     async def connect(self) -> None:
         await self._runner.connect()
@@ -165,7 +162,7 @@ class MainLoop(RobotLoop):
     def on_lost(self, reason: str) -> None:
         if self.over.is_set():
             return
-        # The robot's motion since the last frame shows in the next one, if that comes soon.
+        # If the next frame arrives soon, its samples show the motion since the last one.
         self._was_at_rest = self._runner.is_at_rest
         self.heartbeat.phase, self._unanswered = "rejoining", None
         cause = LINK_LOST.text(reason=reason)
@@ -173,18 +170,18 @@ class MainLoop(RobotLoop):
         self._telemetry.notify_operator("warning", f"{cause}; reconnecting")
 
     def _fail(self, error: Exception) -> None:
-        """End this process, held; the supervisor restarts it."""
+        """End this process with wheels held; the supervisor restarts it."""
         self._failure = self._failure or error
         self.over.set()
 
     def finish(self, status: ExitStatus) -> None:
-        """End the process with a status, once the last messages are out."""
+        """End the process with a status, after the last messages are sent."""
         self.exit_status = status
         self.heartbeat.phase = "done"
         self.over.set()
 
     async def end(self, stop: asyncio.Event) -> None:
-        if not self.is_lockstep:  # there the last frame has its answer, and a second one would race with the permit
+        if not self.is_lockstep:  # in lockstep the last frame has been answered; a second answer would be a race
             self.send_drive(self.clock.seq, STILL)
         self._runner.log_statistics()
         self._save_checkpoint()
@@ -194,8 +191,8 @@ class MainLoop(RobotLoop):
             raise self._failure
         if stop.is_set():
             return
-        # The end is repeated until the supervisor has received it and stops this process, however far behind it is: it
-        # would take a process that ends by itself for one that died, and restart it.
+        # Repeat the end until the supervisor has received it and stops this process. If the process ended by itself,
+        # the supervisor would restart it.
         self.heartbeat.phase = "done"
         while not stop.is_set():
             try:
@@ -209,7 +206,7 @@ class MainLoop(RobotLoop):
         await self._runner.close()
 
     def _save_checkpoint(self) -> None:
-        if self.clock.has_begun:  # before its first frame the predecessor's checkpoint is better
+        if self.clock.has_begun:  # before the first frame, the checkpoint of the earlier process is better
             self._runner.save_checkpoint()
 
     # -- beside the frames ----------------------------------------------------------------------------------------
@@ -220,7 +217,7 @@ class MainLoop(RobotLoop):
         if self.heartbeat.phase != "starting":
             self._publish_status()
         if self._runner.mission.state.is_paused and not self._runner.is_busy:
-            self._answer_held_frame()  # a frame now and then, so that an emergency acts in a pause, too
+            self._answer_held_frame()  # answer a frame from time to time, so that an emergency acts in a pause, too
         stands = self.heartbeat.phase != "done" and self._runner.is_at_rest
         now_s = time.monotonic()
         self._escalate_pause(now_s)
@@ -229,7 +226,7 @@ class MainLoop(RobotLoop):
             self._telemetry.notify_operator("warning", f"the robot stands for {lasts_s:.0f} s: {self._why_it_stands()}")
 
     def update_alarms(self) -> None:
-        """Raise and end alarms: what danger finds, what holds the mission or sends it home, and what it waits for."""
+        """Raise and end alarms: findings of danger, and causes why the mission is held, goes home or waits."""
         own = [active_cause(cause) for cause in self._runner.causes]
         while (received := self._danger_events.receive()) is not None:
             event = received[2]
@@ -239,7 +236,7 @@ class MainLoop(RobotLoop):
         self.alarms.update([*own, *self._danger_active], self.clock.t_s)
 
     def _escalate_pause(self, now_s: float) -> None:
-        """A pause that persists needs a fix before the robot moves again, and then an operator."""
+        """After its first limit a pause needs a fix before the robot moves; after its second one it is a fault."""
         mission = self._runner.mission
         state = mission.state
         waits = state.mode is HELD and not state.is_held_by_hand and condition_of(state.cause) in OWN_PAUSES
@@ -255,7 +252,7 @@ class MainLoop(RobotLoop):
             self._telemetry.notify_operator("error", cause)
 
     def _why_it_stands(self) -> str:
-        """The reason, and what to do."""
+        """The reason for a standstill, with advice."""
         phase, state, age_s = self.heartbeat.phase, self._runner.mission.state, self.heartbeat.frame_age_s
         robot = f"the robot at {self.robot_cfg.host}:{self.robot_cfg.port}"
         if phase == "starting":
@@ -269,7 +266,7 @@ class MainLoop(RobotLoop):
         if self._runner.is_busy:
             why = self._runner.status().cause or "is it ready, the line of sight free?"
             return f"waiting for a measurement of the laser system; {why}"
-        # A mission that has not begun waits for what danger finds without a cause of its own.
+        # A mission that has not begun has no cause of its own while it waits for a finding of danger to end.
         found = [alarm.cause for alarm in self.alarms.alarms if not alarm.ended]
         cause = next(iter((*filter(None, (state.cause,)), *found)), str(state.mode))
         row, otherwise = condition_of(cause), "'ccatp resume' goes on" if state.is_paused else "it goes on by itself"
@@ -289,7 +286,7 @@ class MainLoop(RobotLoop):
             self.send_drive(self.clock.seq, STILL)
 
     def _interrupt(self, row: Condition, **values: float) -> bool:
-        """Hold the mission until frames are fresh; whether it was not held before, or for another of these causes."""
+        """Hold the mission until frames are fresh; returns whether this changed its state or its cause."""
         mission, cause = self._runner.mission, row.text(**values)
         before = mission.state
         mission.handle(Interrupted(cause))
@@ -324,7 +321,7 @@ class MainLoop(RobotLoop):
             await router.serve()
 
     async def _answer_operator(self, frame: bytes) -> bytes:
-        """A command is answered after it took effect or was refused."""
+        """Answer a command after it took effect or was refused."""
         try:
             request = parse_operator(frame)
         except BadRequest as error:
@@ -356,10 +353,7 @@ class MainLoop(RobotLoop):
     # -- the frame ------------------------------------------------------------------------------------------------
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
-        """Serve one frame: estimate, decide, drive; then telemetry.
-
-        An unexpected error ends the process, held, and not just the connection.
-        """
+        """Serve one frame: estimate, plan, drive; then telemetry. An unexpected error ends the process, wheels held."""
         if self.over.is_set():
             return
         runner, clock, seq, begun_s = self._runner, self.clock, sensors.seq, time.perf_counter()
@@ -373,14 +367,14 @@ class MainLoop(RobotLoop):
             self.heartbeat.frame_s = time.monotonic()
 
             runner.estimate(frame)
-            if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
+            if dt_s <= 0.0:  # the localizer counts it; a controller cannot go back in time
                 self._telemetry.add_line(seq, raw)
                 self._answer(seq, STILL)
                 return
 
             asked_s = time.perf_counter()
             verdict = None
-            if not is_first:  # of a session; no frame of it came before, on which there could be one
+            if not is_first:  # the first frame of a session has no earlier frame with a verdict
                 verdict = self._verdicts.latest(seq, self.frame_period_s, is_lockstep=self.is_lockstep)
             decided_s = time.perf_counter()
             drive = runner.plan(frame, verdict, 0.0) if self.is_lockstep else self._plan_in_time(frame, verdict)
@@ -395,7 +389,7 @@ class MainLoop(RobotLoop):
             self._fail(UnhandledError(f"internal error: {what}"))
 
     def _begin_drives(self, unseen_s: float) -> None:
-        """Before the first drive and not on joining, so that in lockstep the robot gets it in a certain frame."""
+        """Begin the drives of a session: here and not on joining, so that in lockstep the frame is always the same."""
         self._is_new_session = False
         self._runner.begin_drives()
         if unseen_s > UNSEEN_S and not self._was_at_rest:
@@ -404,7 +398,7 @@ class MainLoop(RobotLoop):
             self._runner.on_tracking_gap()
 
     def _plan_in_time(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
-        """The drive that answers a frame on the wall clock. One that is too late moves nothing."""
+        """The drive that answers a frame in real time; zero if the frame is too late."""
         runner, robot, begun_s = self._runner, self.robot_cfg, time.monotonic()
         lag_s = self.lateness.add(frame.sensors.t, begun_s)
         age_s = self._frame_age.largest_s(frame.sensors.cmd, begun_s)
@@ -424,7 +418,7 @@ class MainLoop(RobotLoop):
         drive = runner.plan(frame, verdict, lag_s)
         now_s = time.monotonic()
         is_slow, is_still = now_s - begun_s > self.frame_period_s, drive == STILL
-        # A hold for the cost of planning would have to be planned away again, and so on for ever on a slow machine.
+        # No hold for the delay of planning: it would cause new planning, and so on without end on a slow machine.
         self._catches_up_until_s = now_s + CATCH_UP_S if is_slow and is_still else -inf
         return drive
 
@@ -445,7 +439,7 @@ class MainLoop(RobotLoop):
             self.link.send_drive(self._drive_seq, ack, drive.right_rad_s, drive.left_rad_s, drive.steer_rad)
 
     def _answer(self, seq: int, drive: DriveCommand) -> None:
-        # A robot that is driven does not wait.
+        # Only a standing robot waits for its answer.
         is_still = not (drive.right_rad_s or drive.left_rad_s)
         if is_still and self.is_lockstep and self._stops_time():
             self._unanswered = seq
@@ -453,18 +447,18 @@ class MainLoop(RobotLoop):
             self.send_drive(seq, drive)
 
     def _stops_time(self) -> bool:
-        """In lockstep simulated time stands still while a peer is awaited, and all but still in a pause."""
+        """In lockstep simulated time stops while a peer is awaited, and almost stops in a pause."""
         runner = self._runner
         return runner.is_busy or (runner.mission.state.is_paused and runner.is_at_rest)
 
     def _answer_held_frame(self) -> None:
-        """Answer the frame that waits, standing."""
+        """Answer the waiting frame with a zero drive."""
         seq, self._unanswered = self._unanswered, None
         if seq is not None:
             self.send_drive(seq, STILL)
 
     def release_time(self) -> None:
-        """Something changed between two frames, as after a measurement or a pause: lockstep time may go on."""
+        """After a change between two frames, such as the end of a measurement or a pause: continue lockstep time."""
         if not (self.is_lockstep and self._stops_time()):
             self._answer_held_frame()
         self._save_checkpoint()
@@ -472,7 +466,7 @@ class MainLoop(RobotLoop):
 
 
 def open_runner(args: ProcessArgs) -> AbstractContextManager[Callable[[MainLoop], MissionRunner]]:
-    """THE table of missions: opens the database, yields a factory. Only the configured one is imported, to be quick."""
+    """THE table of missions: opens the database, yields a factory. Imports only the configured one, to save time."""
     cfg = args.config
     if isinstance(cfg, RadioConfig):
         from ccatp.daemon.beacon_runner import open_beacons  # noqa: PLC0415

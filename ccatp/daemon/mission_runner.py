@@ -1,6 +1,6 @@
-"""The interface of missions in the main loop, and the frames and drives between the two.
+"""The interface between main loop and mission, and the frames and drives that they exchange.
 
-The process keeps links, clock, order and end; the mission keeps everything that depends on its kind. A new kind of
+The main loop handles links, clock, order and end; the mission everything that depends on its kind. A new kind of
 mission is a subclass of ``MissionRunner`` and a row in ``main_loop.open_runner``.
 """
 
@@ -33,13 +33,11 @@ EXIT_STATUS = {
 
 
 class TimedFrame(msgspec.Struct, frozen=True):
-    """A frame as it is served.
+    """A frame to be served.
 
-    Attributes:
-        t_s: its time, without jumps; that of the robot stands in ``sensors``.
-        dt_s: since the frame before; not positive where the robot's clock or frames went back.
-        is_first: of a session.
-        is_estimate_due: the danger loop is sent the estimate; of a first frame always, because it may wait for that.
+    ``t_s``: its time without jumps (``sensors`` has the robot's time). ``dt_s``: since the frame before; <= 0 if the
+    robot's clock or frames went back. ``is_first``: of a session. ``is_estimate_due``: send the estimate to the danger
+    loop; always in a first frame, because the danger loop may wait for it.
     """
 
     sensors: Sensors
@@ -51,7 +49,7 @@ class TimedFrame(msgspec.Struct, frozen=True):
 
 
 class DriveCommand(msgspec.Struct, frozen=True):
-    """Set points of the wheels, rad/s, and of the steering, rad, where the robot has one."""
+    """Set points of the wheels, rad/s, and of the steering, rad, ``None`` without a steered wheel."""
 
     right_rad_s: float
     left_rad_s: float
@@ -71,16 +69,16 @@ class MissionRunner(ABC):
         on_drive: Callable[[int, float, float], None] = lambda *_: None,
     ) -> None:
         self.mission, self.telemetry, self.on_drive = mission, telemetry, on_drive
-        self.since_s = 0.0  # when the state began
+        self.since_s = 0.0  # start of the present state
 
     @property
     def is_busy(self) -> bool:
-        """Waits for a peer: in lockstep time stands still."""
+        """Waits for a peer; meanwhile lockstep time stands still."""
         return False
 
     @property
     def causes(self) -> list[str]:
-        """What holds the mission, sends it home, or makes it wait, as it is shown."""
+        """Texts of the causes why the mission is held, goes home, or waits."""
         state = self.mission.state
         return [cause for cause in (state.cause, state.abort_cause) if cause]
 
@@ -98,10 +96,10 @@ class MissionRunner(ABC):
         """The newest values for a display, after the first frame."""
 
     async def connect(self) -> None:
-        """Connect to peers other than the robot; raises ``UnreachableError`` where one does not answer."""
+        """Connect to peers other than the robot. Raises ``DaemonUnreachableError`` if one does not answer."""
 
     async def run(self) -> None:
-        """Work beside the frames, until cancelled."""
+        """Background work between the frames, until cancelled."""
         await asyncio.Event().wait()
 
     async def close(self) -> None:
@@ -112,25 +110,25 @@ class MissionRunner(ABC):
         """Raise ``ConfigError`` for a robot whose own geometry contradicts the configuration."""
 
     def begin_session(self, hello: Hello) -> None:
-        """A session begins; its first frame comes next."""
+        """Begin a session, before its first frame."""
 
     def begin_drives(self) -> None:
-        """The first frame of a session is here, and is answered next: send commands that are due once."""
+        """Send commands that are due once per session, before the answer to its first frame."""
 
     @abstractmethod
     def on_tracking_gap(self) -> None:
-        """The robot booted, or moved without frames."""
+        """Handle a boot of the robot, or a motion without frames."""
 
     def save_checkpoint(self) -> None:
-        """Save the state for a main loop that takes over."""
+        """Save the state for another main loop that takes over."""
 
     @abstractmethod
     def publish_state(self) -> None:
-        """Publish a new state, and end where that is the end."""
+        """Publish a changed state, and end the process if it is the last one."""
 
     @abstractmethod
     def log_statistics(self) -> None:
-        """The process ends: log statistics."""
+        """Log statistics at the end of the process."""
 
     # -- the frame, in this order -----------------------------------------------------------------------------------
 
@@ -140,12 +138,12 @@ class MissionRunner(ABC):
 
     @abstractmethod
     def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
-        """The drive that answers the frame, which is served ``lag_s`` late; no verdict where none is in force."""
+        """The drive that answers the frame, served ``lag_s`` late; ``verdict``: in force, or ``None``."""
 
     @abstractmethod
     def hold(self, frame: TimedFrame) -> DriveCommand:
-        """In place of ``plan``: the robot stands, and nothing is decided in this frame."""
+        """Called instead of ``plan``: the robot stands, and the mission does not step in this frame."""
 
     @abstractmethod
     def publish(self, frame: TimedFrame) -> None:
-        """The drive is sent: publish the estimate, keep records."""
+        """After the drive is sent: publish the estimate, write records."""

@@ -1,7 +1,7 @@
 """The agent of the observatory control system (extra ``ocs``): surveys as its process, commands as its tasks.
 
-A survey is a process of its own, started here or elsewhere (systemd, an operator); the agent follows it by the operator
-channel. A survey outlives its agent, and a restarted agent follows it again.
+A survey is a separate process, started by the agent, systemd or an operator. The agent follows it over the operator
+channel. The survey continues if the agent ends, and a restarted agent follows it again.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from ccatp.links.topics import MissionStatus
 Answer = tuple[bool, str]
 PERIOD_S = 0.5
 RUNNING = ("starting", "running")  # states of a session of OCS
-# A survey that was started publishes its status within this: processes, planning, joining.
+# A started survey publishes its status within this time (processes, planning, joining).
 START_TIMEOUT_S = 60.0
 ENDINGS: Mapping[int, str] = {
     ExitStatus.COMPLETE: "the survey is complete",
@@ -34,7 +34,7 @@ ENDINGS: Mapping[int, str] = {
     ExitStatus.UNREACHABLE: "the robot or the laser system did not answer",
     ExitStatus.INTERRUPTED: "interrupted, the wheels are held",
 }
-# The feed always has the same fields, numbers and short texts: their names there and in the status.
+# The feed always has the same fields (numbers and short texts): names in the feed and in the status.
 UNCHANGED = "state", "cause", "point", "done", "skipped", "total", "elapsed_s", "eta_s"
 FEED_FIELDS = {
     **{name: name for name in UNCHANGED},
@@ -83,7 +83,7 @@ class SurveyTask:
                 session.data = msgspec.to_builtins(status)
                 if session.status not in RUNNING and not is_aborted:
                     is_aborted = self.ask("abort")[0]
-            elif child is None:  # it was there, and is gone
+            elif child is None:  # the survey has ended
                 break
             elif last is None and time.monotonic() > deadline_s:
                 child.terminate()
@@ -95,11 +95,11 @@ class SurveyTask:
         if code < 0:
             return False, "the survey is over"
         ending = ENDINGS.get(code, f"the survey ended with status {code}; see its log")
-        # A session that was stopped asked for the abort.
+        # An abort is a success if stopping the session requested it.
         return code == ExitStatus.COMPLETE or (is_aborted and code == ExitStatus.ABORTED), ending
 
     def ask(self, order: str, session: Any | None = None) -> Answer:
-        """One order to the daemon: status, pause, resume, abort, stop."""
+        """Send one command to the daemon: status, pause, resume, abort, stop."""
         try:
             status: MissionStatus = getattr(self.client, order)()
         except CcatpError as error:
@@ -109,7 +109,7 @@ class SurveyTask:
         return True, f"{order}: {status.state}"
 
     def monitor(self, session: Any, publish: Callable[[dict[str, Any]], None], period_s: float) -> Answer:
-        """Publish the status periodically until the session is stopped; ``session.data`` is what was published last."""
+        """Publish the status periodically until the session is stopped; ``session.data`` has the last status."""
         while session.status in RUNNING:
             status, now_s, until_s = self._status(), time.time(), time.monotonic() + period_s
             blocks = {"daemon": {"running": int(status is not None)}}
@@ -140,7 +140,7 @@ ORDERS = ("status", "pause", "resume", "abort", "stop")
 TIMEOUT_S = 10.0
 
 
-# Of the agent's command line; all but the period are those of ``ccatp run``.
+# Options of the agent's command line, which it passes on to ``ccatp run``.
 OPTIONS: dict[str, dict[str, Any]] = {
     "--sim": {"action": "store_true", "help": "simulate robot and laser system"},
     "--realtime": {"action": "store_true", "help": "with --sim: pace the simulation on the wall clock"},
@@ -186,7 +186,7 @@ def main(args: Sequence[str] | None = None) -> None:
     parsed = site_config.parse_args(agent_class=AGENT_CLASS, parser=parser, args=args)
     if not parsed.sim and parsed.config is None:
         parser.error("name the robot's configuration with --config FILE, or add --sim")
-    # Said to the survey too: a simulation for which it is not would take another folder where it is in use.
+    # Passed to the survey as well, because a simulation without it would take another folder if this one is in use.
     parsed.runtime_dir = runtime_dir_path(str(parsed.runtime_dir or ""), os.environ)
     agent, runner = ocs_agent.init_site_agent(parsed)
     surveys = SurveyTask(

@@ -1,6 +1,6 @@
-"""Common frame of every process: arguments, log file, end with its parent, signals, errors.
+"""Common base of all processes: arguments, log file, end with the parent, signals, errors.
 
-Writing a log line never fails: what the disk does not take is dropped and counted.
+Writing a log line never fails; lines that the disk does not take are dropped and counted.
 """
 
 import argparse
@@ -31,16 +31,16 @@ from ccatp.errors import CcatpError
 
 PR_SET_PDEATHSIG = 1
 BACKLOG = 64  # of listening sockets
-# The copy of the fault plan in the run directory.
+# Copy of the fault plan in the run directory.
 FAULTS_FILE = "faults.toml"
-# In the runtime directory: the run directory of the run that goes on there, or of the last one.
+# In the runtime directory: path of the run directory of the present or the last run.
 RUN_DIR_FILE = "run_dir"
-# Beside it: host and port of the robot, the laser system and the page of that run, as JSON.
+# In the runtime directory: host and port of robot, laser system and page of this run, as JSON.
 ADDRESSES_FILE = "addresses.json"
 # Environment variable with the supervisor's process number, for its children.
 SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
 
-# Flags of the command line of a process, and what they say.
+# Flags of the command line of a process, and their fields in ``ProcessArgs``.
 FLAGS = {
     "--realtime": "is_realtime",
     "--resume": "is_resuming",
@@ -63,7 +63,7 @@ class Endpoints:
 
 
 def run_dir_in(runtime_dir: Path) -> Path | None:
-    """The run directory of the run that goes on in a runtime directory, or of the last one."""
+    """The run directory of the present or the last run in a runtime directory."""
     try:
         return Path(os.fsdecode(read_input(runtime_dir / RUN_DIR_FILE).strip()))
     except OSError:
@@ -74,14 +74,14 @@ def run_dir_in(runtime_dir: Path) -> Path | None:
 class ProcessArgs:
     """Arguments of a process."""
 
-    config: Config | RadioConfig  # exactly that of the run, from its run directory
+    config: Config | RadioConfig  # from the run directory
     run_dir: Path
     endpoints: Endpoints
     listen_fd: int | None  # an inherited listening socket
     is_realtime: bool
-    is_resuming: bool  # go on with the mission in the run directory
-    has_faults: bool = False  # a fault plan is in the run directory; simulators only
-    is_restarted: bool = False  # takes the place of one of this run that died; of a resumed run, after its first frame
+    is_resuming: bool  # continue the mission in the run directory
+    has_faults: bool = False  # a fault plan is in the run directory; only for simulators
+    is_restarted: bool = False  # replaces a process of this run that died; in a resumed run, after its first frame
     is_held: bool = False
     is_sim: bool = False  # robot and laser system are simulated
 
@@ -99,9 +99,9 @@ def processes_of(cfg: Config | RadioConfig) -> ProcessesConfig:
 def read_config(
     path: Path | None, settings: Mapping[str, object] | None = None, *, any_ports: bool = False
 ) -> Config | RadioConfig:
-    """The configuration in a file, of a survey or of a mission among beacons, with dotted keys laid over it.
+    """The configuration in a file, of a survey or of a mission among beacons; ``settings``: dotted keys that override.
 
-    ``any_ports``: simulated servers take any free port where neither file nor keys name one.
+    ``any_ports``: simulated servers without a configured port take any free one.
     """
     is_radio = path is not None and is_radio_file(path)
     load = load_radio_config if is_radio else load_config
@@ -109,7 +109,7 @@ def read_config(
 
 
 def start_process(argv: list[str] | None = None) -> ProcessArgs:
-    """Arguments of this process, which ends with the supervisor; its sockets can be used by its own user only."""
+    """Arguments of this process. It will end with the supervisor, and only its own user can use its sockets."""
     die_with_parent()
     try:
         args = parse_args(argv)
@@ -125,8 +125,8 @@ def start_process(argv: list[str] | None = None) -> ProcessArgs:
 
 
 def parse_args(argv: list[str] | None = None) -> ProcessArgs:
-    """Read the command line of a process and the configuration it names."""
-    os.umask(os.umask(0o077) | 0o022)  # to connect to a socket takes the right to write to it
+    """Read the command line of a process, and its configuration."""
+    os.umask(os.umask(0o077) | 0o022)  # connecting to a socket requires the permission to write to it
     parser = argparse.ArgumentParser()
     parser.add_argument("--run-dir", type=Path, required=True)
     parser.add_argument("--runtime-dir", dest="endpoints", type=lambda text: Endpoints(Path(text)), required=True)
@@ -138,11 +138,11 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
 
 
 def die_with_parent() -> None:
-    """Ask the kernel for SIGTERM when the parent dies: a plain child would survive its parent's ``kill -9``."""
+    """Let the kernel send SIGTERM when the parent dies; otherwise a child survives the ``kill -9`` of its parent."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.environ.get(SUPERVISOR_PID, str(os.getppid())) != str(os.getppid()):
-            raise SystemExit("ccatp: the supervisor is gone")  # it died before we asked
+            raise SystemExit("ccatp: the supervisor is gone")  # it died before the call
 
 
 def open_log(path: Path, process: str) -> structlog.typing.FilteringBoundLogger:
@@ -152,7 +152,7 @@ def open_log(path: Path, process: str) -> structlog.typing.FilteringBoundLogger:
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True, key="timestamp"),
-            # Without values of variables: keys and tokens are among them.
+            # Without values of variables, which may include keys and tokens.
             structlog.processors.ExceptionRenderer(structlog.tracebacks.ExceptionDictTransformer(show_locals=False)),
             structlog.processors.JSONRenderer(),
         ],
@@ -165,8 +165,8 @@ def open_log(path: Path, process: str) -> structlog.typing.FilteringBoundLogger:
 class LogStream(io.TextIOBase):
     """Appends whole lines; several processes may share the file.
 
-    When the first line is dropped, ``process`` reports it on standard error. Raises ``OSError`` where the file cannot
-    be made. ``dropped``: lines that are not in the file, or only in part.
+    The first dropped line is reported on standard error, with the name ``process``. Raises ``OSError`` if the file
+    cannot be created. ``dropped``: number of lines that are not completely in the file.
     """
 
     def __init__(self, path: Path, process: str) -> None:
@@ -183,7 +183,7 @@ class LogStream(io.TextIOBase):
         try:
             written = self._file.write(data)
             why = "" if written == len(data) else "the disk took a part of a line"
-            # After a part of a line the next one begins with a line feed, also where in between nothing was written.
+            # After a partial line the next one begins with a line feed, also if writes in between failed.
             self._is_torn = written != len(data) and (self._is_torn or bool(written))
         except OSError as error:
             why = error.strerror or str(error)
@@ -236,12 +236,12 @@ def run_until_stopped(serve: Callable[[asyncio.Event], Coroutine[Any, Any, int]]
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         status = runner.run(run())
-    gc.freeze()  # else the interpreter visits every object of the libraries once more, which is half of a shutdown
+    gc.freeze()  # otherwise the interpreter visits all objects of the libraries again, which doubles the shutdown time
     return status
 
 
 def run_process(name: str, serve: Callable[["zmq.Context[zmq.Socket[bytes]]", asyncio.Event], Awaitable[int]]) -> int:
-    """The same with a context of ZeroMQ, which is closed at the end.
+    """As ``run_until_stopped``, with a ZeroMQ context that is closed at the end.
 
     Expected errors are printed. Returns the exit status, or the highest one of the errors.
     """

@@ -1,4 +1,4 @@
-"""What the main loop and the danger loop have in common: session at the robot, bus, and tasks that end together."""
+"""Common base of main loop and danger loop: session with the robot, bus, and tasks that end together."""
 
 import asyncio
 import gc
@@ -17,23 +17,18 @@ from ccatp.links.bus import PERIOD_S, HeartbeatPublisher, PeerSubscriber, Publis
 from ccatp.links.robot_messages import Role
 
 WAIT_PERIOD_S = 0.02
-# In lockstep the robot sends the next frame as soon as it has its answers, or the last one again after a second.
+# In lockstep the robot sends the next frame as soon as it has its answers, or repeats the last one after a second.
 REPEAT_S = 1.0
-# A copy of a frame that comes sooner is a duplicated line: the robot has the answer, or sends the frame once more.
+# A copy of a frame that arrives sooner is a duplicated line and needs no answer.
 DUPLICATE_S = 0.5
-# A frame that does not come is reported after this time; one whose line was not valid comes again, and was missed for
-# at least so long.
+# A missing frame is reported after the first time; after an invalid line, whose frame the robot repeats, after the
+# second one.
 OVERDUE_S, INVALID_S = 3.0, 0.5
 LOCKSTEP_SILENCE_S = 30.0
 
 
 class RobotLoop(RobotSession):
-    """A loop at the robot, and the process around it.
-
-    Attributes:
-        peer: the messages of the other loop.
-        over: set when the loop ends by itself.
-    """
+    """A loop with a session at the robot. ``peer``: messages of the other loop; ``over``: the loop ends by itself."""
 
     peer: PeerSubscriber
 
@@ -46,12 +41,12 @@ class RobotLoop(RobotSession):
         self.heartbeat = HeartbeatPublisher(self.publisher, name)
         self.lateness = LatenessStatistics(self.robot_cfg.slip_after_s)
         self.over = asyncio.Event()
-        # In lockstep, on the monotonic clock: begin of the session, frame received again, answer sent again, line that
-        # was not valid; and the frame whose successor was reported as overdue.
+        # In lockstep, by the monotonic clock: start of the session, last repeated frame, last repeated answer, last
+        # invalid line, and the frame whose successor was reported as overdue.
         self._joined_s = self._repeated_s = self._answered_again_s = self._invalid_s = self._reported_s = 0.0
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Join the robot together with the other loop, then serve frames until the end or until ``stop`` is set."""
+        """Join the robot together with the other loop, then serve frames until ``over`` or ``stop`` is set."""
         async with asyncio.TaskGroup() as tasks:
             served = [tasks.create_task(service) for service in self.services()]
             try:
@@ -71,50 +66,50 @@ class RobotLoop(RobotSession):
             if stop.is_set():
                 return
             await asyncio.sleep(WAIT_PERIOD_S)
-        gc.freeze()  # else a collection in the middle of the run visits every object of the libraries, some 50 ms long
+        gc.freeze()  # otherwise a collection during the run visits all objects of the libraries, for about 50 ms
         joins = self.join(is_patient=self._args.is_taking_over)
         if await unless_stopped(stop, joins) and not self.is_lockstep:
             realtime.enter(processes_of(self._args.config).realtime_priority, self.log)
 
     @abstractmethod
     def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
-        """What is served beside the frames."""
+        """The services that run besides the frames."""
 
     async def connect(self) -> None:
         """Connect to peers other than the robot and the other loop."""
 
     @abstractmethod
     def is_peer_ready(self) -> bool:
-        """Messages reach the other loop, and it has got as far as this one has to wait for."""
+        """Whether messages reach the other loop, and it is ready for this one to join."""
 
     @abstractmethod
     async def end(self, stop: asyncio.Event) -> None:
-        """The last messages and lines of the log."""
+        """Send the last messages, write the last lines of the log."""
 
     async def close(self) -> None:
         """Close the resources of ``connect``."""
 
     def publish_levels(self) -> None:
-        """Publish what is repeated beside the heartbeat."""
+        """Publish the levels, which are repeated with the heartbeat."""
 
     def is_frame_due(self) -> bool:
-        """In lockstep: the last frame was answered, and it is the robot's turn."""
+        """In lockstep: whether the last frame was answered, so that the robot has to send the next one."""
         return False
 
     @abstractmethod
     def answer_again(self) -> None:
-        """Send the last answer of the session again, if there is one, with a new number and nothing else changed."""
+        """Repeat the last answer of the session, if any, with a new number."""
 
     @abstractmethod
     def report_overdue(self, text: str) -> None:
-        """In lockstep a frame is missing, and the robot stands: report it."""
+        """Report that a frame is missing in lockstep, so that the robot stands."""
 
     def on_bad_line(self) -> None:
         """See ``RobotSession``."""
         self._invalid_s = time.monotonic()
 
     def on_repeated(self) -> None:
-        """In lockstep the robot misses an answer, of this loop or of the other one."""
+        """In lockstep the robot repeats a frame when it has not received an answer of this or the other loop."""
         if self.is_lockstep:
             self._repeated_s = time.monotonic()
             self._answer_again_after(DUPLICATE_S)
@@ -126,9 +121,9 @@ class RobotLoop(RobotSession):
             self.answer_again()
 
     def _watch_lockstep(self, frame_s: float) -> None:
-        """Send the answer again each second, report a frame that does not come, and drop a robot that is silent.
+        """Repeat the answer each second, report a missing frame, and drop the connection to a silent robot.
 
-        The answer is also sent again while a newer one is withheld: that keeps the session.
+        The answer is also repeated while a newer one is withheld, to keep the session.
         """
         self._answer_again_after(REPEAT_S)
         now_s = time.monotonic()
@@ -139,16 +134,16 @@ class RobotLoop(RobotSession):
             self._reported_s = frame_s
             sends = "a line that is not valid" if is_invalid else "its last frame again" if is_repeated else "nothing"
             self.report_overdue(f"the robot stands: no new frame for {age_s:.1f} s in lockstep; it sends {sends}")
-        # The monitor gets no frame before a controller has joined.
+        # The monitor receives no frames before a controller has joined.
         if silent_s > LOCKSTEP_SILENCE_S and (self._role == "controller" or frame_s > self._joined_s):
             self.drop(f"no sensors frame for {silent_s:.0f} s in lockstep, not even the last one again")
 
     @abstractmethod
     def on_silence(self, age_s: float) -> None:
-        """No frame came for so long, in real time; called all the time, also while frames are prompt."""
+        """Handle the age of the newest frame; called periodically in real time, also while frames are prompt."""
 
     def begin_session(self) -> None:
-        """Frames are judged and counted from here on."""
+        """Begin a session: restart the statistics of lateness and the age of the frames."""
         self.lateness.reset()
         self._joined_s = time.monotonic()
         self.heartbeat.phase, self.heartbeat.frame_s = "joined", self._joined_s
@@ -161,7 +156,7 @@ class RobotLoop(RobotSession):
             await asyncio.sleep(PERIOD_S)
 
     async def watch(self) -> None:
-        """Act where frames stop coming, and drop a connection that is open and silent; until cancelled."""
+        """Handle missing frames, and drop a silent connection; until cancelled."""
         while True:
             await asyncio.sleep(WAIT_PERIOD_S)
             self.peer.maintain()

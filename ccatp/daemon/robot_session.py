@@ -1,4 +1,4 @@
-"""Sessions at the robot: a link that reconnects, and the lateness of its frames."""
+"""Sessions with the robot: a link that reconnects, and the lateness and age of its frames."""
 
 import asyncio
 import random
@@ -12,30 +12,27 @@ from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, Robo
 from ccatp.links.robot_messages import CommandEcho, Hello, Role, Sensors
 
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0
-# After this time without an answer the connection is closed and another one is tried. The last attempt has at least the
-# shorter time, so that its reason is the robot's and not that no time was left.
+# An attempt to connect without an answer ends after the first time. The last attempt has at least the second one, so
+# that it fails for a reason of the robot and not for lack of time.
 ATTEMPT_S, SHORTEST_ATTEMPT_S = 2.0, 0.25
-# Refusals that will be repeated.
+# Refusals that another attempt does not change.
 FINAL = ("bad mac", "bad protocol")
-# The rate of the robot's clock may be wrong by a hundredth and may wander; that of the host is much better.
+# The rate of the robot's clock may be wrong by 1 % and may change; that of the host is much better.
 MAX_DRIFT = 1.02e-2
-# Drives whose times are known: ten seconds of them at 100 Hz.
+# Number of drives whose times are stored: ten seconds at 100 Hz.
 SENT_DRIVES = 1024
 
 
 def delay_s(failures: int, share: float) -> float:
-    """Wait before the next attempt, s: doubled each time, spread by the random ``share`` (0 to 1) of each client."""
+    """Backoff before the next attempt, s: doubled each time, with jitter by the random ``share`` (0 to 1)."""
     return max(FIRST_DELAY_S, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2.0 ** min(failures, 10)) * (0.5 + 0.5 * share))
 
 
 class RobotSession(ABC):
-    """Keeps a role at the robot, in one session after the other; a subclass handles what comes from it.
+    """Keeps a role at the robot over successive sessions; a subclass handles the events.
 
-    Attributes:
-        sessions: their number so far.
-        hello: of the newest session.
-        is_lockstep: simulated time waits for the answers; false before the first session.
-        has_rebooted: the robot has restarted between the last session and this one.
+    ``sessions``: their number so far. ``hello``: of the newest session. ``is_lockstep``: simulated time waits for the
+    answers; false before the first session. ``has_rebooted``: the robot restarted since the last session.
     """
 
     def __init__(self, cfg: LinkConfig, role: Role, client: str) -> None:
@@ -50,21 +47,21 @@ class RobotSession(ABC):
 
     @abstractmethod
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
-        """Serve one frame, which came as this line; in lockstep a session begins with the last frame again."""
+        """Serve one frame; ``raw``: its line. In lockstep a session begins with a repetition of the last frame."""
 
     @abstractmethod
     def on_joined(self, hello: Hello) -> None:
-        """A session begins; its first frame comes next."""
+        """Begin a session, before its first frame."""
 
     @abstractmethod
     def on_lost(self, reason: str) -> None:
-        """The session is lost; the robot holds itself."""
+        """Handle the loss of the session; the robot holds itself."""
 
     def on_bad_line(self) -> None:  # noqa: B027 - nothing has to be done
-        """A line failed a check."""
+        """Handle an invalid line."""
 
     def on_repeated(self) -> None:  # noqa: B027 - nothing has to be done
-        """The newest frame came again."""
+        """Handle a repetition of the newest frame."""
 
     def _make(self) -> RobotLink:
         return RobotLink(
@@ -81,13 +78,9 @@ class RobotSession(ABC):
         )
 
     async def join(self, *, is_patient: bool) -> None:
-        """Join for the first time.
+        """Join for the first time. Raises ``DaemonUnreachableError``: the robot does not answer, or refuses.
 
-        Args:
-            is_patient: try for as long as after a loss, because the robot may still hold a dead session's role.
-
-        Raises:
-            UnreachableError: the robot does not answer, or refuses.
+        ``is_patient``: try for as long as after a loss, because the robot may still keep the role of a dead session.
         """
         if is_patient:
             await self._join_again()
@@ -97,8 +90,7 @@ class RobotSession(ABC):
     async def serve(self) -> None:
         """Join again after each loss, until cancelled.
 
-        Raises:
-            UnreachableError: no session with frames for ``reconnect_timeout_s``, or a refusal that is final.
+        Raises ``DaemonUnreachableError``: no session with frames for ``reconnect_timeout_s``, or a final refusal.
         """
         while True:
             await self._lost.wait()
@@ -142,7 +134,7 @@ class RobotSession(ABC):
         self.on_lost(reason)
 
     def drop(self, reason: str) -> None:
-        """Close a connection that is open and silent; ``serve`` makes another one."""
+        """Close a silent connection; ``serve`` opens another one."""
         if self._is_joined:
             self.link.abort(reason)
 
@@ -152,17 +144,11 @@ class RobotSession(ABC):
 
 
 class LatenessStatistics:
-    """Measures the lag of each frame against the promptest recent one.
+    """Measures the lag of each frame relative to the most prompt recent one.
 
-    The difference of the host's clock to the robot's is least for a frame that was served at once. It may grow by the
-    drift of the clocks; the rest is the frame's lag. A constant delay does not show, nor a queue that grows as slowly
-    as clocks may drift: those show in the age by the echo (``FrameAge``).
-
-    Args:
-        late_after_s: a frame served later than this misses its deadline.
-
-    Attributes:
-        missed_deadlines: frames served later than ``late_after_s``.
+    The difference of host and robot clock is smallest for a frame that was served at once. It may grow by the drift of
+    the clocks; the rest is the lag. A constant delay, or a queue that grows as slowly as the clocks may drift, is not
+    measured here but by ``FrameAge``. ``missed_deadlines``: frames served later than ``late_after_s``.
     """
 
     __slots__ = ("_late_after_s", "_least_s", "_t_s", "missed_deadlines", "worst_s")
@@ -174,13 +160,13 @@ class LatenessStatistics:
         self.worst_s = 0.0
 
     def reset(self) -> None:
-        """Restart: another session, or another boot."""
+        """Restart for another session or boot."""
         self._t_s = inf
 
     def add(self, t_s: float, wall_s: float) -> float:
-        """The lag of a frame, s, from the robot's time and the host's monotonic clock when the frame is served.
+        """The lag of a frame, s; ``t_s``: robot time, ``wall_s``: the host's monotonic clock when it is served.
 
-        Where the robot's time runs backwards, its clock was set and the measurement restarts.
+        If the robot's time runs backward, its clock was set, and the measurement restarts.
         """
         offset_s = wall_s - t_s
         if t_s < self._t_s:
@@ -196,20 +182,20 @@ class LatenessStatistics:
 
 
 class FrameAge:
-    """The largest age that a frame may have, by the echo of a drive: no clock has to agree with another one for it.
+    """Upper bound of the age of a frame from the echo of a drive, without synchronised clocks.
 
-    The robot got the drive after it was sent, and took the frame ``cmd.age`` later. What is left of the time until now
-    is the way of the drive and the way of the frame; how it is shared between the two is not known.
+    The robot received the drive after it was sent, and made the frame ``cmd.age`` later. The rest of the time until now
+    is the delay of the drive plus that of the frame; how it is divided between them is not known.
     """
 
     def __init__(self) -> None:
         self._sent: list[tuple[int, float]] = [(-1, 0.0)] * SENT_DRIVES
 
     def add_drive(self, seq: int, wall_s: float) -> None:
-        """A drive is sent."""
+        """Record the time of a sent drive."""
         self._sent[seq % SENT_DRIVES] = seq, wall_s
 
     def largest_s(self, echo: CommandEcho, wall_s: float) -> float:
-        """The largest age of a frame that is served now, s; 0 where it echoes no drive of this process."""
+        """The largest possible age of a frame served now, s; 0 if it echoes no drive of this process."""
         seq, sent_s = self._sent[echo.seq % SENT_DRIVES]
         return max(wall_s - sent_s - echo.age, 0.0) if seq == echo.seq >= 0 else 0.0

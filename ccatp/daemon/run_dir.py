@@ -1,4 +1,4 @@
-"""Run directory and runtime directory, each locked by one daemon; the resumable run; the options of ``ccatp run``."""
+"""Run directory and runtime directory, each locked by one daemon; resumable runs; options of ``ccatp run``."""
 
 import itertools
 import json
@@ -22,16 +22,16 @@ from ccatp.links.runtime_dir import BESIDE, LOCK_FILE, TRUTH_LOCK_FILE, locked, 
 from ccatp.records.recorder import TELEMETRY, read_metadata
 
 FILE = Path("runs") / "unfinished"
-# What was latched when a run finished, for the next one: whoever has to clear it finds no daemon in between.
+# Emergencies that were active when a run finished, for the next run, because without a daemon nobody can clear them.
 LATCHED_FILE = Path("runs") / EMERGENCIES
-# In the run directory: what cannot change when it is resumed, and does not stand in its configuration.
+# In the run directory: properties that a resumed run keeps, and that are not in its configuration.
 ORIGIN_FILE = "origin.json"
-# Complete, or at base after an abort: there is nothing to go on with.
+# Complete, or at base after an abort: such a run is not resumed.
 FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
 
 
 def find_resumable() -> Path | None:
-    """The directory of the run that did not finish, ``None`` where there is none with a mission in it."""
+    """The directory of the run that did not finish, ``None`` if there is none with a mission."""
     try:
         text = os.fsdecode(read_input(FILE).strip())
     except FileNotFoundError:
@@ -53,7 +53,7 @@ def find_unfinished() -> Path:
 
 
 def finished_summary(run_dir: Path) -> dict[str, Any] | None:
-    """The summary of a mission whose points are all measured, ``None`` for any other."""
+    """The summary of a mission whose points are all measured, else ``None``."""
     try:
         summary = json.loads(read_text(run_dir / "summary.json"))
         points = summary["points"]
@@ -64,7 +64,7 @@ def finished_summary(run_dir: Path) -> dict[str, Any] | None:
 
 
 def mark_resumable(run_dir: Path) -> None:
-    """Note that a run has begun; raises ``ConfigError`` where the note cannot be written."""
+    """Record in ``FILE`` that a run has begun; raises ``ConfigError`` if it cannot be written."""
     try:
         FILE.parent.mkdir(parents=True, exist_ok=True)
         write_durably(FILE, os.fsencode(run_dir) + b"\n")
@@ -75,7 +75,7 @@ def mark_resumable(run_dir: Path) -> None:
 
 
 def clear_finished(status: int, run_dir: Path) -> None:
-    """Remove the note of a run that has finished; keep emergencies in force for the next. ConfigError: it cannot."""
+    """Remove the record of a finished run; save its active emergencies for the next one. ConfigError: it cannot."""
     if status not in FINISHED:
         return
     emergencies = run_dir / EMERGENCIES
@@ -95,7 +95,7 @@ def clear_finished(status: int, run_dir: Path) -> None:
 
 
 def take_over_emergencies(run_dir: Path) -> bool:
-    """Whether emergencies were in force when the last run finished, which are copied. ConfigError: they cannot be."""
+    """Copy the emergencies of the last run that are still active; whether there are any. ConfigError: it cannot."""
     try:
         kept = LATCHED_FILE.read_bytes()
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -113,14 +113,14 @@ class RunOptions:
 
     sim: bool  # simulate robot and laser system
     config_file: Path | None = None
-    # Dotted keys given on the command line (``{"run.seed": 2}``), stronger than the file.
+    # Dotted keys from the command line (``{"run.seed": 2}``), which override the file.
     overrides: Mapping[str, object] = field(default_factory=dict)
-    realtime: bool = False  # pace the simulation on the wall clock instead of in lockstep
+    realtime: bool = False  # simulate in real time instead of in lockstep
     run_dir: Path | None = None  # None for ``default_run_dir``
     resume: bool = False  # continue the mission in ``run_dir``
     held: bool = False  # begin held
     recover: bool = False  # continue, held, the run that did not finish, or begin one that can be recovered
-    json_output: bool = False  # the summary goes to standard output as JSON, and nothing else does
+    json_output: bool = False  # standard output is the summary as JSON, and nothing else
     runtime_dir: Path | None = None  # folder of the unix sockets
     faults_file: Path | None = None  # plan of simulated faults; a copy goes into the run directory
     shows_summary: bool = True
@@ -128,7 +128,7 @@ class RunOptions:
 
     @property
     def is_paced(self) -> bool:
-        """The robot follows the wall clock: there is time to sleep between frames."""
+        """The robot runs in real time, so that processes sleep between frames."""
         return self.realtime or not self.sim
 
 
@@ -138,13 +138,13 @@ def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Pa
 
 
 def recover(options: RunOptions, cfg: Config, run: Callable[[RunOptions, Config], int]) -> int:
-    """Go on, held, with the run that did not finish; else begin a new one that may be recovered."""
+    """Continue, held, the run that did not finish; otherwise begin a new one that can be recovered."""
     run_dir = find_resumable()
     if run_dir is not None:
         options = replace(options, run_dir=run_dir, resume=True, held=True)
     else:
         run_dir = default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC)).absolute()
-        # An emergency latched when the last run ended stays latched: the robot waits at its base until it is cleared.
+        # An emergency of the last run stays latched: the robot waits at base until it is cleared.
         options = replace(options, run_dir=run_dir, held=take_over_emergencies(run_dir))
         mark_resumable(run_dir)
     status = run(options, cfg)
@@ -152,27 +152,27 @@ def recover(options: RunOptions, cfg: Config, run: Callable[[RunOptions, Config]
     return status
 
 
-# In run directory and runtime directory: held by every child of the supervisor.
+# Lock in run directory and runtime directory, held by every child of the supervisor.
 CHILDREN_LOCK = ".children"
-PREDECESSORS_S = 30.0  # a process that is just being started on an overloaded machine takes long to notice
-# In the runtime directory. Those of the truth may be of a simulated robot that runs alone, beside a run without one.
+PREDECESSORS_S = 30.0  # a process that starts on an overloaded machine needs long to notice the supervisor's death
+# In the runtime directory. The sockets of the truth may belong to a simulated robot that runs alone.
 SOCKETS = ("main", "danger", "control", "emergency", "dashboard")
 TRUTH_SOCKETS = ("truth", "puck")
-MOST_BESIDE = 99  # simulations at a time that no runtime directory is configured for
+MOST_BESIDE = 99  # largest number of concurrent simulations without a configured runtime directory
 
 
 def owned(path: Path, option: str) -> AbstractContextManager[int]:
-    """Hold a lock; raises ``RefusedError``, which names the ``option`` for another place, where it is held."""
+    """Hold a lock. If it is held already, raises ``RefusedError``, which names the ``option`` for another place."""
     refusal = f"another ccatp runs in {path.parent}; end it with 'ccatp stop', or give this one its own {option}"
     return locked(path, refusal)
 
 
 def await_predecessors(stack: ExitStack, *folders: Path) -> tuple[int, ...]:
-    """Locks of the folders for the children to inherit, until the stack is closed.
+    """Lock the folders until the stack is closed; the children inherit the locks.
 
-    Children of a supervisor that was killed end by themselves, after it; meanwhile they write their last records, and
-    remove sockets as they close them. So these locks are had when the last of them has ended. RefusedError: some are
-    still there after ``PREDECESSORS_S``.
+    The children of a killed supervisor end by themselves a little later. Until then they write their last records and
+    remove their sockets, so this waits for the end of the last one. RefusedError: some still run after
+    ``PREDECESSORS_S``.
     """
     locks = []
     for folder in folders:
@@ -183,10 +183,10 @@ def await_predecessors(stack: ExitStack, *folders: Path) -> tuple[int, ...]:
 
 
 def take_runtime_dir(stack: ExitStack, configured: str, *, is_sim: bool) -> Path:
-    """Make a runtime directory and own it until the stack is closed: the configured one, else the usual one.
+    """Create a runtime directory and lock it until the stack is closed: the configured one, else the usual one.
 
-    A simulation for which none is configured takes another one beside the usual one while that is in use. ConfigError:
-    it cannot be made; RefusedError: it is in use.
+    If the usual one is in use, a simulation without a configured one takes another one next to it. ConfigError: it
+    cannot be created; RefusedError: it is in use.
     """
     usual = folder = make_runtime_dir(configured, os.environ)
     for number in itertools.count(2):
@@ -205,9 +205,9 @@ def take_runtime_dir(stack: ExitStack, configured: str, *, is_sim: bool) -> Path
 
 
 def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> None:
-    """Lock a runtime directory until the stack is closed, and remove the sockets then.
+    """Lock a runtime directory until the stack is closed; then remove its sockets.
 
-    RefusedError: another daemon has it, or a simulated robot that runs alone.
+    RefusedError: another daemon uses it, or a simulated robot that runs alone.
     """
     stack.enter_context(owned(runtime_dir / LOCK_FILE, "--runtime-dir"))
     if is_sim:
@@ -217,9 +217,9 @@ def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> Non
 
 
 def with_origin(options: RunOptions) -> RunOptions:
-    """The options of a run that is resumed, simulated or not as it began.
+    """The options with ``sim`` as the resumed run began.
 
-    ConfigError: it began at a real robot, and a simulated one is wanted.
+    ConfigError: it began with a real robot, and a simulation is requested.
     """
     if not options.resume or options.run_dir is None or (began := _began_simulated(options.run_dir)) is None:
         return options
@@ -229,10 +229,10 @@ def with_origin(options: RunOptions) -> RunOptions:
 
 
 def _began_simulated(run_dir: Path) -> bool | None:
-    """Whether a run began in simulation; ``None`` where that is not known."""
+    """Whether a run began in simulation; ``None`` if that is not known."""
     if (is_sim := _read_origin(run_dir).get("simulation")) is not None:
         return bool(is_sim)
-    try:  # of an older version: the recording says so as well
+    try:  # a run of an older version: its recording has it, too
         simulation = read_metadata(run_dir / TELEMETRY).get("simulation")
     except (OSError, CcatpError):
         return None
@@ -248,20 +248,20 @@ def _read_origin(run_dir: Path) -> dict[str, Any]:
 
 
 def read_run_id(run_dir: Path) -> str:
-    """What distinguishes the files of this run from those of another one; empty if an older version began it."""
+    """The id that distinguishes the files of this run from those of others; empty if an older version began it."""
     return str(_read_origin(run_dir).get("run_id", ""))
 
 
 def keep_origin(run_dir: Path, *, is_sim: bool, is_new: bool) -> None:
-    """Note what a run begins with, for ``with_origin``, and its id; a run that is resumed keeps its own."""
+    """Save the id of a run, and whether it is simulated, for ``with_origin``; a resumed run keeps its id."""
     run_id = uuid4().hex if is_new else read_run_id(run_dir)
     write_durably(run_dir / ORIGIN_FILE, json.dumps({"simulation": is_sim, "run_id": run_id}).encode())
 
 
 def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
-    """The directory of a run that is new, or of a survey that is resumed with the points that it was planned with.
+    """The directory of a new run, or of a survey that is resumed with the same points.
 
-    ConfigError: options or configuration contradict its content, or it cannot be made.
+    ConfigError: options or configuration contradict its content, or it cannot be created.
     """
     is_survey = isinstance(cfg, Config)
     name = cfg.run.mirror if isinstance(cfg, Config) else cfg.system
@@ -302,7 +302,7 @@ def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
 
 
 def _make_new(path: Path) -> Path:
-    """Make a run directory, with a number behind its name where another run began in the same second."""
+    """Create a run directory, with a number after its name if another run began in the same second."""
     made = path
     for number in itertools.count(2):
         try:

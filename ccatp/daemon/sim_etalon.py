@@ -46,9 +46,9 @@ def main() -> int:
 
 
 def run_alone(cfg: Config, puck_world_m: Vector3 | None, truth: str | None) -> int:
-    """The simulated server alone, for other controllers; ends on SIGINT or SIGTERM.
+    """Run only the simulated server, for other controllers, until SIGINT or SIGTERM.
 
-    The puck stands still at ``puck_world_m`` (world frame), or follows ``truth``; at base where neither is given.
+    The puck stands at ``puck_world_m`` (world frame), or follows ``truth``; without both it stands at base.
     """
     mirror, at = build_mirror(cfg.mirror), cfg.sim.etalon
     at_base = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)

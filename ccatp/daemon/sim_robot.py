@@ -1,4 +1,4 @@
-"""The process of the simulated robot behind the robot link."""
+"""The process of the simulated robot."""
 
 import asyncio
 import os
@@ -46,12 +46,12 @@ def main() -> int:
 def run_alone(
     cfg: Config | RadioConfig, lockstep: bool, faults: FaultPlan | None = None, runtime_dir: Path | None = None
 ) -> int:
-    """The simulated robot alone, of a survey or among beacons, for other controllers; ends on SIGINT or SIGTERM.
+    """Run only the simulated robot, of a survey or among beacons, for other controllers, until SIGINT or SIGTERM.
 
-    A fall is never on the link: standard error says when and where (``robot_fell``), and the status is that of a fault.
-    It listens at the address in ``sim.robot``. Its true state is at ``puck`` in the runtime directory (the configured
-    one by default), for ``ccatp sim etalon --truth``. ConfigError: it cannot listen there; RefusedError: another
-    simulated robot uses that directory.
+    It listens at the address in ``sim.robot``. The link does not report a fall: standard error has its time and place
+    (``robot_fell``), and the status is that of a fault. The true state is available at ``puck`` in the runtime
+    directory (by default the configured one), for ``ccatp sim etalon --truth``. ConfigError: it cannot listen there;
+    RefusedError: another simulated robot uses that directory.
     """
     folder = make_runtime_dir(str(runtime_dir or processes_of(cfg).runtime_dir), os.environ)
     truth, what = Endpoints(folder).of("puck"), cfg.system if isinstance(cfg, RadioConfig) else cfg.mirror.name

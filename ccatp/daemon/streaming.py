@@ -1,6 +1,6 @@
 """``ccatp stream``: streams the runs of a runtime directory live, one after the other.
 
-It subscribes when the loops have joined the robot; no process waits for it or counts it.
+It subscribes after the loops have joined the robot, and no other process depends on it.
 """
 
 import json
@@ -38,14 +38,14 @@ from ccatp.report.foxglove import (
 PASSED_ON = ("mission", "arrival", "rest", "treatment", "fix", "danger_event")
 TURNED_INTO_VIEWS = ("estimate", "sensors", "fix", "truth", "log")
 RUN = "run"
-# A late subscriber gets their last message.
+# Topics whose last message a late subscriber receives.
 LATCHED = {RUN, *(view.name for view in VIEWS if view.is_latched)}
 PERIOD_MS = 20
 NICENESS = 10
 
 
 class RunFact(msgspec.Struct):
-    """The run that is streamed; the first message of a stream."""
+    """The streamed run; the first message of a stream."""
 
     mirror: str
     world: str
@@ -56,7 +56,7 @@ class RunFact(msgspec.Struct):
 
 
 def streamed_schemas() -> list[tuple[str, dict[str, object]]]:
-    """Name and schema of every topic that is streamed."""
+    """Name and schema of every streamed topic."""
     raw = [(name, plain_schema(schema_of(name), f"ccatp.{BY_NAME[name].message.__name__}")) for name in PASSED_ON]
     return [(RUN, plain_schema(msgspec.json.schema(RunFact), "ccatp.Run")), *raw, *view_schemas()]
 
@@ -156,8 +156,8 @@ def serve(
 ) -> int:
     """Stream until SIGINT or SIGTERM.
 
-    ``plotjuggler_port, foxglove_port``: 0 takes any free one, ``None`` serves none. ``is_open``: the host may be an
-    address of the network. StreamError: a stream cannot be served.
+    ``plotjuggler_port``, ``foxglove_port``: 0 takes any free port, ``None`` disables the stream. ``is_open``: permits
+    a host address that is not local. StreamError: a stream cannot be served.
     """
     check_host(host, is_open=is_open)
     folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
@@ -169,7 +169,7 @@ def serve(
 
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        stack.callback(context.destroy, 0)  # term would wait without end for a socket that an error left open
+        stack.callback(context.destroy, 0)  # term would wait forever for a socket that an error left open
         streams: list[LiveStream] = []
         if plotjuggler_port is not None:
             streams.append(PlotJugglerStream(context, host, plotjuggler_port))

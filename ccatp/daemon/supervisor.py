@@ -1,4 +1,4 @@
-"""THE process table, and one run of it: start of the children, supervision, summary."""
+"""THE process table, and a run of these processes: start, supervision, summary."""
 
 import importlib.util
 import json
@@ -64,22 +64,22 @@ from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat, MissionStatu
 from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens
 
-# Between two looks at messages and processes: in lockstep a message in each of them would cost as much again.
+# Period of the polls of messages and processes; waking up for each message would double the cost in lockstep.
 POLL_S = 0.02
-STDERR = 2  # its descriptor
-# Of one process: a page for each of 32 clients, sockets, recording, database; most systems permit 1024.
+STDERR = 2  # file descriptor
+# Open files of one process: 32 clients of the page, sockets, recording, database. Most systems permit 1024.
 OPEN_FILES = 256
-# For posts of alarms that are under way at the end.
+# Time for alarm posts in progress at the end.
 WEBHOOK_PATIENCE_S = 0.5
-# So many at a time: a signal and a death are noticed in between.
+# Largest number of messages per poll, so that signals and dead processes are noticed in between.
 MAX_MESSAGES = 1000
-STATUS_PERIOD_S = 1.0  # of what a service reports of its mission
-# Messages of a service in a watchdog period, and the part of it after which silence of a loop withholds them.
+STATUS_PERIOD_S = 1.0  # least time between two status messages to the service manager
+# Watchdog messages per watchdog period, and the part of it after which a silent loop stops them.
 STROKES, STALE_SHARE = 4.0, 0.5
 
-# In the order of starting; stopping is in the reverse order, so that main holds the wheels first.
+# In the order of starting. They stop in the reverse order, so that main holds the wheels first.
 PROCESSES: tuple[ProcessSpec, ...] = (
-    # First, so that it is there for the end of the others. It gets the time they leave: it may be silent for a minute.
+    # First, so that it shows the end of the others. It has the lowest priority, so it may be silent for a minute.
     ProcessSpec(
         "dashboard",
         "ccatp.daemon.dashboard",
@@ -95,7 +95,7 @@ PROCESSES: tuple[ProcessSpec, ...] = (
     ProcessSpec("main", "ccatp.daemon.main_loop", is_loop=True),
 )
 
-# Without laser system, because radio measures. A main loop that dies takes the map with it: held, and over.
+# Without a laser system, because positions come from radio. When main dies, its map is lost, and the run ends, held.
 BEACON_PROCESSES = tuple(
     replace(spec, is_replaceable=spec.is_replaceable and spec.name != "main")
     for spec in PROCESSES
@@ -114,11 +114,11 @@ class Service:
         self._text = ""
 
     def on_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """A heartbeat was received."""
+        """Take a heartbeat."""
         self._liveness.update(heartbeat)
 
     def update(self, now_s: float, status: MissionStatus | None, *, is_recovering: bool = False) -> None:
-        """Send due messages; while ``is_recovering`` from a restart the watchdog is served in any case."""
+        """Send due messages; while ``is_recovering`` from a restart, the watchdog is always served."""
         if not self._notifier.has_listener:
             return
         if not self._is_ready:
@@ -138,7 +138,7 @@ class Service:
             self._notifier.send(f"STATUS={text}")
 
     def stopping(self) -> None:
-        """The run ends."""
+        """Report that the run ends."""
         self._notifier.send("STOPPING=1", "STATUS=holding the wheels and saving")
 
 
@@ -152,8 +152,8 @@ def _status_text(status: MissionStatus | None) -> str:
 class SupervisedRun:
     """The children of one run and the messages collected from them.
 
-    ``sockets``: listening sockets of simulators and dashboard, by the name of the process. ``locks``: descriptors that
-    every child inherits. ``started_s``: of the monotonic clock, for the wall time of the run.
+    ``sockets``: listening sockets of simulators and dashboard, by process name. ``locks``: descriptors that every child
+    inherits. ``started_s``: start of the run by the monotonic clock.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class SupervisedRun:
         what = {"system": cfg.system} if isinstance(cfg, RadioConfig) else {"mirror": cfg.mirror.name}
         self._log.info("run_started", **what, seed=cfg.run.seed, sim=is_sim)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        # A flag and no exception: a signal must neither be lost in a handler of exceptions nor end the shutdown.
+        # A flag instead of an exception, so that no exception handler loses a signal, and no signal ends the shutdown.
         previous = {n: signal.signal(n, self._interrupt) for n in STOP_SIGNALS}
         try:
             collector = Collector(context, self._endpoints, self._run_dir, cfg, self._on_heartbeat, is_sim=is_sim)
@@ -210,7 +210,7 @@ class SupervisedRun:
         return int(status)
 
     def _write(self, summary: dict[str, Any]) -> None:
-        """Complete or not at all: the summary of an earlier session is better than half of a new one."""
+        """Write the summary completely or not at all, so that a failure keeps that of an earlier session."""
         path = self._run_dir / "summary.json"
         try:
             write_durably(path, (json.dumps(summary, indent=1) + "\n").encode())
@@ -230,27 +230,27 @@ class SupervisedRun:
             token = token_query(self._cfg.dashboard, self._endpoints.runtime_dir) if has_token else ""
             self._view.show_message(self._page.level, self._page.text + token)
         for process in BEACON_PROCESSES if isinstance(self._cfg, RadioConfig) else PROCESSES:
-            # A process that listens has a socket, if it is to run at all.
+            # A process that listens runs only if it has a socket.
             if process.name in self._sockets or not process.listens:
                 self._children.start(process)
         if not self._options.is_paced and sys.platform == "linux":
-            # The three that answer each other keep both cores of a small machine busy: recording does not interrupt
-            # them. No niceness: an ordinary user cannot take it back, and beside other work the messages would pile up.
+            # Robot, main and danger keep both cores of a small machine busy, and recording must not interrupt them. Not
+            # by niceness, because an ordinary user cannot reduce it again, and messages would pile up under load.
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
         while not self._is_interrupted:
             time.sleep(POLL_S)
             collector.collect(0, self._view, MAX_MESSAGES)
             self._webhook.update(collector.status)
-            # From main's first frame on the checkpoint is of this session; before, the next main begins as the first.
+            # From main's first frame on, the checkpoint is of this session. A main restarted before begins anew.
             self._has_begun |= collector.status is not None and collector.status.seq >= 0
             now_s = time.monotonic()
             self._service.update(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
-            # A death comes first: the messages of the others are its consequence.
+            # A dead process is handled first, because the messages of the others are its consequence.
             if (death := self._children.poll(now_s)) is not None:
                 name, code, end, text = death
                 self._log.error("process_died", name=name, code=code)
                 if end is ProcessEnd.END:
-                    # It has reported why. After a restart the robot may be anywhere.
+                    # The process has reported why. After a restart the robot may be anywhere, so the status is held.
                     return ExitStatus.HELD if self._children.restarts else ExitStatus(code)
                 self._notify_operator("error", f"{text}; see {self._run_dir / 'log.jsonl'}")
                 return ExitStatus.HELD
@@ -286,9 +286,9 @@ class SupervisedRun:
 
 
 def run(options: RunOptions) -> int:
-    """Run what the configuration is of, a survey or a mission among beacons, to its end.
+    """Run the configured survey or mission among beacons to its end; returns the exit status (docs, ``cli.md``).
 
-    Returns the exit status of ``cli.md``. CcatpError: the run could not begin.
+    CcatpError: the run could not begin.
     """
     cfg = read_config(options.config_file, dict(options.overrides), any_ports=options.sim)
     if isinstance(cfg, Config):
@@ -304,7 +304,7 @@ def run(options: RunOptions) -> int:
 
 
 def run_survey(options: RunOptions) -> int:
-    """Run one survey to its end, and nothing else; status and errors as of ``run``."""
+    """Run one survey to its end; status and errors as ``run``."""
     return _run(options, load_config(options.config_file, dict(options.overrides), any_ports=options.sim))
 
 
@@ -313,7 +313,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
     permit_open_files()
     if options.sim and isinstance(cfg, Config):
         _check_physics(cfg.sim.robot.physics, has_faults=options.faults_file is not None)
-    # The processes read the files of these again; here they are refused before anything has begun.
+    # The processes read these files again; checked here, an error is reported before anything has begun.
     check_observatory(cfg.observatory)
     read_key(cfg.robot.key_file, must_be_private=not options.sim)
     if cfg.dashboard.token_file:
@@ -337,7 +337,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
         stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
         locks = await_predecessors(stack, runtime_dir, run_dir)
         if options.resume and (done := finished_summary(run_dir)) is not None:
-            # Nothing is left of the mission: its record stays as it is.
+            # The mission is complete: its record stays as it is.
             if options.json_output:
                 print(json.dumps(done))
             count = done["points"]["total"]
@@ -353,7 +353,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
 
 
 def _check_physics(physics: str, *, has_faults: bool) -> None:
-    """ConfigError: what the simulated robot needs is not there, before a process of its own finds out."""
+    """Raises ``ConfigError`` if the physics of the simulated robot is not available, before its process starts."""
     if has_faults and physics != "lag":
         raise ConfigError(f'--faults: plans are for sim.robot.physics = "lag", not for "{physics}"')
     if physics == "mujoco" and importlib.util.find_spec("mujoco") is None:
@@ -361,7 +361,7 @@ def _check_physics(physics: str, *, has_faults: bool) -> None:
 
 
 def permit_open_files() -> None:
-    """Raise the limit of open files, which the processes inherit; ConfigError: the system permits fewer than needed."""
+    """Raise the limit of open files, which the processes inherit; ConfigError: the system permits too few."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if 0 <= hard < OPEN_FILES:  # -1 is no limit
         raise ConfigError(f"only {hard} files may be open, a run needs {OPEN_FILES}; raise the limit with ulimit -n")

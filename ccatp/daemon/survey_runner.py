@@ -48,12 +48,12 @@ if TYPE_CHECKING:
     from ccatp.daemon.main_loop import MainLoop
 
 
-# A record in the first of so many frames, ten a second: in that of an estimate.
+# Period of the checkpoint in frames, ten per second.
 PERIOD_FRAMES = 10
 
 
 class CheckpointWriter:
-    """Keeps the checkpoint up to date; ``boot`` is the robot's."""
+    """Keeps the checkpoint up to date; ``boot``: boot number of the robot."""
 
     def __init__(self, run_dir: Path, localizer: Localizer, mission: Mission, is_patient: bool) -> None:
         self._file = CheckpointFile(run_dir / FILE, is_patient=is_patient)
@@ -65,30 +65,30 @@ class CheckpointWriter:
         self.boot = -1
 
     def is_due(self, seq: int) -> bool:
-        """Asked in each frame: in the first of ten, in that of an abort, and where the state changed during a hold."""
+        """Whether to write in this frame: the first of ten, that of an abort, or a change of the state in a hold."""
         if seq // PERIOD_FRAMES != self._period:
             return True
         state = self._mission.state
         return state.abort_cause != self._in_force[0] or (state.mode is HELD and state is not self._written)
 
     def write(self, seq: int, t_s: float, elapsed_s: float) -> None:
-        """Write the state of frame ``seq``; durably where abort or hold changed."""
+        """Write the state of frame ``seq``; durably if abort or hold changed."""
         state = self._written = self._mission.state
         self._period = seq // PERIOD_FRAMES
         record = Checkpoint.of(self._localizer, state, seq, t_s, elapsed_s, self.boot, self._run_id)
         pose = record.pose
         if not isfinite(pose.x_m + pose.y_m + pose.heading_rad + record.sigma_m + record.heading_sigma_rad):
-            return  # the last good one is a better guess
+            return  # keep the last valid one
         before, self._in_force = self._in_force, (state.abort_cause, state.cause if state.is_held_by_hand else "")
         self._file.write(record, is_durable=self._in_force != before)
 
     def close(self) -> None:
-        """Write the record that waits."""
+        """Write the waiting record."""
         self._file.close()
 
 
 def state_text(state: MissionState, cause: str) -> str:
-    """Text for the state in which a mission is held, or for the one after that."""
+    """Text about a hold, or about the state after it."""
     if cause:
         return f"{state}: {cause}"
     is_end = state in (MissionState.HELD, MissionState.BACKING_OFF, MissionState.DONE)
@@ -112,7 +112,7 @@ class GateLog:
         if denial is None:
             return
         logged_s = self._logged_s.get(denial)
-        # A clock that went back must not silence it.
+        # The first comparison is for a clock that went back, which must not suppress the report.
         if logged_s is not None and 0.0 <= t_s - logged_s < DENIAL_REPEAT_S:
             return
         self._logged_s[denial] = t_s
@@ -125,10 +125,9 @@ class GateLog:
 
 
 class SurveyFrames(ABC):
-    """A survey's frames from samples to set points: in the main-loop process, and in a run in one process.
+    """Processes a survey's frames from samples to set points, in the main loop and in a run in one process.
 
-    What is sent besides, reported and kept is up to who derives from it. ``motion``: the estimate of the newest frame,
-    None where that is stale.
+    Subclasses send, report and record everything else. ``motion``: estimate of the newest frame, None if it is stale.
     """
 
     def __init__(self, cfg: Config, parts: SurveyParts, frame_s: float) -> None:
@@ -144,18 +143,18 @@ class SurveyFrames(ABC):
         """Send the fans' duties, before the first drive and whenever they change."""
 
     def _publish_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
-        """Called where the samples of a frame are taken otherwise than they came; for a replay."""
+        """Record, for a replay, that the samples of a frame are not used as they were received."""
         del sensors, kind, values
 
     @abstractmethod
     def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
-        """The robot is at rest, or is to be measured."""
+        """Handle a command with ``at_rest`` or ``measure``."""
 
     def estimate(self, frame: TimedFrame) -> None:
-        """Give the frame's samples to the localizer, as far as they can be trusted."""
+        """Pass the frame's samples to the localizer, as far as they are trusted."""
         sensors, mission, localizer = frame.sensors, self.mission, self.localizer
         start, self._start = self._start, None
-        if start is not None:  # a replay has to know where the localizer of a loop that takes over begins
+        if start is not None:  # a replay needs the start pose of a localizer that takes over
             begun, sigmas = start
             self._publish_treatment(sensors, "begun", (begun.x_m, begun.y_m, begun.heading_rad, *sigmas))
         state = mission.state
@@ -166,7 +165,7 @@ class SurveyFrames(ABC):
         imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_cause:
-            # A filter that diverged is frozen until it has a fix.
+            # A filter that diverged is frozen until the next fix.
             mission.handle(EstimateDiverged(localizer.hold_cause, frame.t_s))
             localizer.clear_hold()
         if frame.dt_s <= 0.0:
@@ -186,7 +185,7 @@ class SurveyFrames(ABC):
         return self.localizer.position_sigma_m
 
     def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
-        """The mission's velocity, as far as the gate permits it."""
+        """The drive for the mission's velocity, as far as the gate permits it."""
         mission, motion, sensors = self.mission, self.motion, frame.sensors
         if motion is None:
             raise RuntimeError("plan comes after estimate, and not for a stale frame")
@@ -195,7 +194,7 @@ class SurveyFrames(ABC):
         if command.inflates_covariance or state.wants_calibration or state.full_fans or state.hold.is_fault:
             self._apply_requests(sensors, command)
             state = mission.state
-        # A verdict has the robot's own time, which may have jumped.
+        # The gate compares with the verdict's time, which is the robot's own and may have jumped.
         right, left = self.gate.pass_through(command.twist, verdict, motion.dt_s, sensors.t, lag_s, state.purpose)
         if command.at_rest or command.measure:
             self._execute(command, motion)
@@ -211,17 +210,17 @@ class SurveyFrames(ABC):
         self.parts.measure_grip()
 
     def _apply_requests(self, sensors: Sensors, command: MissionCommand) -> None:
-        """Requests of the mission besides the drive, before that is sent."""
+        """Execute the requests of the mission before the drive is sent."""
         health = self.cfg.health
         if command.inflates_covariance:
             doubt = health.doubt_position_m, health.doubt_heading_rad
             self.localizer.inflate_covariance(*doubt)
             self._publish_treatment(sensors, "doubted", doubt)
-        if self.mission.state.full_fans and self.thrust.give_all():  # pressed on first, held then
+        if self.mission.state.full_fans and self.thrust.give_all():  # thrust first, then the drive
             self.begin_drives()
 
     def _estimate_message(self, frame: TimedFrame) -> EstimateMessage:
-        """The estimate for the danger loop, in a frame in which it is due."""
+        """The estimate for the danger loop."""
         deck, sensors = self.localizer.deck_pose, frame.sensors
         place = deck.x_m, deck.y_m, deck.heading_rad, self.localizer.position_sigma_m
         mode, grip = self.mission.state.mode.value, self.thrust.margin
@@ -253,7 +252,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
             store,
             self.telemetry,
             loop.release_time,
-            # lockstep time stands still meanwhile
+            # no wait in lockstep, whose time stands still meanwhile
             lambda: 0.0 if loop.is_lockstep else cfg.etalon.measuring_time_s,
             parts.heading_sigma_rad,
         )
@@ -304,7 +303,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         )
 
     def display_state(self) -> DisplayState:
-        """Pose on the deck, and the filter's last update."""
+        """Deck pose, and the filter's last update."""
         localizer, telemetry = self.localizer, self.telemetry
         pose, covariance, innovation = localizer.deck_pose, localizer.pose_covariance, localizer.innovation
         return DisplayState(
@@ -323,7 +322,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
     # -- beside the frames ----------------------------------------------------------------------------------------
 
     async def connect(self) -> None:
-        """Connect to the laser system; raises ``UnreachableError`` where it does not answer."""
+        """Connect to the laser system; raises ``DaemonUnreachableError`` if it does not answer."""
         try:
             await self._etalon.connect()
         except EtalonError as error:
@@ -345,7 +344,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
     def begin_session(self, hello: Hello) -> None:
         self.sent.begin_session(1.0 / hello.frame_hz)
         self._checkpoint.boot = hello.boot
-        # The robot's own floor counts where the mirror overhangs.
+        # The robot's own floor applies where the mirror overhangs.
         self._fan_gate = FanGate(hello.robot.fan_floor if self.mirror.overhang else 0.0)
 
     def begin_drives(self) -> None:
@@ -365,7 +364,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         self._checkpoint.write(self._clock.seq, self._clock.t_s, self._clock.elapsed_s)
 
     def log_statistics(self) -> None:
-        """Log how often the gates refused, by the reason."""
+        """Log the numbers of refusals of the gates, by reason."""
         self.telemetry.log.info("gate_statistics", denied=self._gate_log.counts, fans_refused=self._fan_gate.refused)
 
     # -- the frame ------------------------------------------------------------------------------------------------
@@ -382,7 +381,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         return drive
 
     def _measure_grip(self) -> None:
-        """The first turns, those of the calibration drive, are the test of grip; it is reported once."""
+        """Report the first measured grip, from the turns of the calibration drive."""
         thrust = self.thrust
         is_test = not thrust.friction
         if self.parts.measure_grip() and is_test:
@@ -395,10 +394,10 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         return STILL
 
     def _is_on_mirror(self, check: MirrorCheck, sensors: Sensors) -> bool:
-        """Whether gravity permits motion: the robot stands on the mirror of the configuration.
+        """Whether the robot may move: gravity shows that it stands on the configured mirror.
 
-        In lockstep the mission begins at once, and ends when gravity contradicts: nothing real can be harmed, and a run
-        stays the same function of its seed.
+        In lockstep the mission begins at once, and ends if gravity contradicts: a simulation cannot do harm, and a run
+        does not depend on this check.
         """
         if check.update(sensors.t, sensors.gravity, self.localizer.deck_pose):
             self._mirror_check = None
@@ -420,7 +419,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
             self._check_unattended_fault(sensors)
 
     def _check_unattended_fault(self, sensors: Sensors) -> None:
-        """An alarm now and then, and the return to base before the battery is too low for it."""
+        """Remind operators periodically, and return to base before the battery is too low for that."""
         mission, timer, pose = self.mission, self._fault_timer, self.localizer.deck_pose
         is_localized = not (mission.state.is_lost or self.localizer.is_frozen)
         home_s = home_time_s(self.mirror.base_pose, self.cfg.limits, pose.x_m, pose.y_m) if is_localized else None
@@ -447,7 +446,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         if command.measure:
             pose = self.localizer.deck_pose
             expected = self.mirror.puck_world(pose, self.cfg.robot.puck_height_m)
-            # The localizer dates a fix by the robot's own clock.
+            # For the localizer, the time of a fix is by the robot's own clock.
             t_s = motion.t_s - self._clock.offset_s
             self._fix_service.begin(
                 FixRequest(mission.state.request, t_s, mission.state.measuring_point, expected, pose)

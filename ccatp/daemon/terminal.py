@@ -1,4 +1,4 @@
-"""What a run shows on the terminal: progress, messages, summary, status table, and the report at its end."""
+"""The terminal output of a run: progress, messages, summary, status table; and the report at its end."""
 
 import json
 import os
@@ -24,13 +24,13 @@ from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionS
 from ccatp.records.summary import format_table
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
-# End a run, or the writing of its report.
+# Signals that end a run, or the writing of its report.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
 
 
 class _BufferedConsole(Console):
-    """A terminal that may be closed: the survey goes on without it."""
+    """A console whose terminal may be closed; the survey continues without it."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
@@ -42,14 +42,14 @@ class _BufferedConsole(Console):
             self.quiet = True
 
 
-# Of danger's findings: what slows the robot, and what does not end by itself; a pause that lasts becomes a hold.
+# Severities of danger's findings that are shown. A pause is not: it ends by itself or becomes a hold.
 SHOWN = {Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT}
 
 
 class RunView:
-    """Progress and messages on standard error; the summary on standard output.
+    """Shows progress and messages on standard error, the summary on standard output.
 
-    ``verbosity``: -1 leaves out progress and whatever is no warning; 1 adds each change of the state.
+    ``verbosity``: -1 shows only warnings and errors; 1 adds each change of the state.
     """
 
     def __init__(self, cfg: Config | RadioConfig, *, is_sim: bool, run_dir: Path, verbosity: int = 0) -> None:
@@ -83,7 +83,7 @@ class RunView:
             self._progress.stop()
 
     def show_message(self, level: str, text: str) -> None:
-        """One line for the operator, unless too many like it were shown; ``log.jsonl`` has them all."""
+        """Show one line to the operator, unless too many similar ones were shown; ``log.jsonl`` has them all."""
         if self._is_quiet and level == "info":
             return
         shown = self._rate_limit.take(level, text, time.monotonic())
@@ -91,7 +91,7 @@ class RunView:
             self._console.print(f"{level}: {printable(shown)}", style=STYLES[level], markup=False, soft_wrap=True)
 
     def show(self, message: Message) -> None:
-        """Show what an operator has to see of a message: progress, lines, the first pose, what danger says."""
+        """Show the part of a message for operators: progress, lines, the first pose, findings of danger."""
         if isinstance(message, TrackMessage) and not self._has_pose and message.rows:
             self._has_pose = True
             _, t_s, row, col, x, y, heading, _ = message.rows[-1]
@@ -133,22 +133,22 @@ class RunView:
         return f"{state} {status.point}".strip() + f", {elapsed}, {rest}"
 
     def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
-        """Print JSON alone on standard output, or a table."""
+        """Print only JSON on standard output, or a table."""
         try:
             print(json.dumps(summary, indent=1) if as_json else format_table(summary), flush=True)
         except OSError as error:
-            # The mission is over, and stays what it was; what is left for the output goes nowhere.
+            # The mission is over and its result is stored; the remaining output is discarded.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             self.show_message("warning", f"standard output cannot be written: {error.strerror}; see summary.json")
 
     def show_report(self, where: str) -> None:
-        """Show where the report is, or why there is none; on standard error, so that JSON stays alone."""
+        """Show where the report is, or why there is none; on standard error, to keep standard output pure JSON."""
         if not self._is_quiet:
             self._console.print(printable(f"report  {where}"), soft_wrap=True, markup=False)
 
 
 def _title_and_goals(cfg: Config | RadioConfig, *, is_sim: bool) -> tuple[str, str]:
-    """Headline of a run, and what is counted in it."""
+    """Headline of a run, and the name of the items that it counts."""
     if isinstance(cfg, Config):
         world = f", world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else ""
         what = f"{'SIMULATION' if is_sim else 'survey'} of {cfg.mirror.name}{world}, filter {cfg.run.filter}"
@@ -161,8 +161,8 @@ def _title_and_goals(cfg: Config | RadioConfig, *, is_sim: bool) -> tuple[str, s
 def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.FilteringBoundLogger) -> str:
     """Write the report of a run that has ended; returns where it is, or why there is none.
 
-    An interrupted run gets none, because the operator waits for the end. A signal ends the writing alone: the run is
-    over, and its status stands.
+    An interrupted run gets none, because the operator waits for the end. A signal only ends the writing; the status of
+    the run does not change.
     """
     by_hand = f"none; make it with: ccatp report {run_dir}"
     if status is ExitStatus.INTERRUPTED:
@@ -181,7 +181,7 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
     except RunReadError as error:
         return f"none; {error}"
     except Exception as error:
-        # The survey is done, and its record is on the disk.
+        # The survey has ended, and its record is on the disk.
         log.error("report_failed", error=f"{type(error).__name__}: {error}")
         return by_hand
     finally:
@@ -202,7 +202,7 @@ def clock(seconds: float) -> str:
 
 
 def _read(status: Mapping[str, Any]) -> MissionStatus:
-    """The ``status`` of the operator channel's answer."""
+    """The ``status`` in the reply of the operator channel."""
     return msgspec.convert({"seq": -1, "t_s": 0.0, "state": "", **status}, MissionStatus, strict=False)
 
 
@@ -212,7 +212,7 @@ def share_done(status: MissionStatus) -> float:
 
 
 def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Name and value of each line of the table, from the ``status`` of the operator channel's answer."""
+    """Name and value of each line of the table, from the ``status`` in the reply of the operator channel."""
     status = _read(answered)
     filled = round(BAR * share_done(status))
     skips = f", {status.skipped} skipped" if status.skipped else ""
@@ -243,7 +243,7 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def alarms_text(alarms: Sequence[Alarm]) -> str:
-    """How many, and how to see them; empty for none."""
+    """Numbers of alarms, and the command that lists them; empty without any."""
     active, unseen = sum(not one.ended for one in alarms), sum(not one.acknowledged_by for one in alarms)
     return f"{active} active, {unseen} not acknowledged; see 'ccatp alarms'" if alarms else ""
 

@@ -1,4 +1,4 @@
-"""Posts what happens to the alarms of a run to ``alarms.webhook_url``, from a thread that nothing waits for."""
+"""Posts the events of the alarms of a run to ``alarms.webhook_url``, from a thread of its own."""
 
 import threading
 import time
@@ -15,15 +15,15 @@ import structlog
 from ccatp.config.models import AlarmsConfig
 from ccatp.links.topics import Alarm, MissionStatus
 
-# Posts that wait; of more the oldest are left out, and the next post says how many.
+# Largest number of waiting posts. Older ones are left out, and the next post has their number.
 MOST_WAITING = 100
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
-# What a server refuses for good, a repetition does not change.
+# Client errors after which a repetition may succeed; the others are final.
 _PASSING = {HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.TOO_MANY_REQUESTS}
 
 
 class AlarmPost(msgspec.Struct, frozen=True):
-    """Body of a post: what happened to an alarm, in which run and state of the mission; ``left_out``: posts before."""
+    """Body of a post: event of an alarm, run, state of the mission; ``left_out``: number of posts left out before."""
 
     event: str
     run: str
@@ -33,7 +33,7 @@ class AlarmPost(msgspec.Struct, frozen=True):
 
 
 def changes(before: dict[str, Alarm], after: dict[str, Alarm]) -> list[tuple[str, Alarm]]:
-    """``raised`` (or graver), ``acknowledged`` and ``ended`` alarms between two lists, by their names."""
+    """The events between two lists, by name: ``raised`` (also to a higher severity), ``acknowledged``, ``ended``."""
     found = []
     for name, alarm in after.items():
         old = before.get(name)
@@ -47,9 +47,9 @@ def changes(before: dict[str, Alarm], after: dict[str, Alarm]) -> list[tuple[str
 
 
 class AlarmWebhook:
-    """Posts the changes of the list of alarms; does nothing where no address is configured.
+    """Posts the changes of the list of alarms; does nothing without a configured address.
 
-    ``known``: the list as an earlier session of the run left it, which has posted it.
+    ``known``: the list at the end of the earlier session of the run, which has posted it.
     """
 
     def __init__(
@@ -77,12 +77,12 @@ class AlarmWebhook:
                 self._left_out = 0
             while len(self._waiting) > MOST_WAITING:
                 self._left_out += 1 + self._waiting[1].left_out
-                del self._waiting[1]  # the first one is under way
+                del self._waiting[1]  # the first one is being posted
             self._changed.notify()
         self._alarms = alarms
 
     def close(self, patience_s: float) -> None:
-        """End it; what cannot be posted within ``patience_s`` is logged as left out."""
+        """End the thread; posts that cannot be sent within ``patience_s`` are logged as left out."""
         if not self._thread.is_alive():
             return
         with self._changed:
@@ -106,7 +106,7 @@ class AlarmWebhook:
                 self._waiting.popleft()
 
     def _deliver(self, post: AlarmPost) -> bool:
-        """Post it, again and again until it is taken, refused for good, or too old; False: the run is over before."""
+        """Post until it is accepted, finally refused, or too old; False: the run ended before."""
         begun_s, pause_s = time.monotonic(), FIRST_PAUSE_S
         while why := self._post(post):
             if why.startswith("refused") or time.monotonic() - begun_s + pause_s > self._cfg.webhook_give_up_s:
@@ -119,7 +119,7 @@ class AlarmWebhook:
         return True
 
     def _post(self, post: AlarmPost) -> str:
-        """Why it was not taken, empty where it was."""
+        """Send a post; returns why it was not accepted, or an empty text."""
         headers = {"content-type": "application/json", "user-agent": "ccatp"}
         url, body = self._cfg.webhook_url, msgspec.json.encode(post)
         try:
