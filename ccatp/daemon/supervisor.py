@@ -75,7 +75,7 @@ WEBHOOK_PATIENCE_S = 0.5
 MAX_MESSAGES = 1000
 STATUS_PERIOD_S = 1.0  # least time between two status messages to the service manager
 # Watchdog messages per watchdog period, and the part of it after which a silent loop stops them.
-STROKES, STALE_SHARE = 4.0, 0.5
+KEEPALIVES, STALE_SHARE = 4.0, 0.5
 
 # In the order of starting. They stop in the reverse order, so that main holds the wheels first.
 PROCESSES: tuple[ProcessSpec, ...] = (
@@ -110,7 +110,7 @@ class Service:
         self._notifier, self._watchdog_s = notifier, watchdog_s
         self._liveness = Liveness(min(STALE_AFTER_S, STALE_SHARE * (watchdog_s or STALE_AFTER_S / STALE_SHARE)))
         self._is_ready = self._is_troubled = False
-        self._stroked_s = self._sent_s = float("-inf")
+        self._kept_alive_s = self._sent_s = float("-inf")
         self._text = ""
 
     def on_heartbeat(self, heartbeat: Heartbeat) -> None:
@@ -127,13 +127,13 @@ class Service:
                 self._notifier.send("READY=1")
             return
         trouble = self._liveness.trouble(now_s)
-        may_stroke = is_recovering or not trouble
-        if self._watchdog_s is not None and may_stroke and now_s - self._stroked_s >= self._watchdog_s / STROKES:
-            self._stroked_s = now_s
+        is_alive = is_recovering or not trouble
+        if self._watchdog_s is not None and is_alive and now_s - self._kept_alive_s >= self._watchdog_s / KEEPALIVES:
+            self._kept_alive_s = now_s
             self._notifier.send("WATCHDOG=1")
-        has_turned, self._is_troubled = bool(trouble) != self._is_troubled, bool(trouble)
+        has_changed, self._is_troubled = bool(trouble) != self._is_troubled, bool(trouble)
         text = f"trouble: {trouble}" if trouble else _status_text(status)
-        if text != self._text and (has_turned or now_s - self._sent_s >= STATUS_PERIOD_S):
+        if text != self._text and (has_changed or now_s - self._sent_s >= STATUS_PERIOD_S):
             self._text, self._sent_s = text, now_s
             self._notifier.send(f"STATUS={text}")
 
@@ -241,7 +241,7 @@ class SupervisedRun:
             time.sleep(POLL_S)
             collector.collect(0, self._view, MAX_MESSAGES)
             self._webhook.update(collector.status)
-            # From main's first frame on, the checkpoint is of this session. A main restarted before begins anew.
+            # From main's first frame on, the checkpoint is of this session. A main loop restarted before begins again.
             self._has_begun |= collector.status is not None and collector.status.seq >= 0
             now_s = time.monotonic()
             self._service.update(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))

@@ -252,7 +252,7 @@ class Preintegrator:
         self._samples = self._frames = 0
 
     def restart(self) -> None:
-        """Drop all samples, because the robot's clock has jumped, or the pose was set anew."""
+        """Drop all samples, because the robot's clock has jumped, or the robot was relocated."""
         self._last = self._before = None
         self._missed = 0
         self._clear()

@@ -54,11 +54,11 @@ class WheelMonitor:
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
         self._cfg, self._radius_m, self._base_m = cfg, robot.wheel_radius_m, robot.wheel_base_m
         self.alarm, self.yaw = FindingLatch(cfg.retry_after_s), FindingLatch(cfg.retry_after_s)
-        self._shortly, self._stalling = SlidingWindow(cfg.runaway_time_s), SlidingWindow(cfg.stall_time_s)
+        self._brief, self._stalling = SlidingWindow(cfg.runaway_time_s), SlidingWindow(cfg.stall_time_s)
         self._turning = SlidingWindow(cfg.yaw_time_s)
         self.speed_m_s = 0.0  # of the faster wheel, over ``runaway_time_s``
         self.spans: deque[Span] = deque(maxlen=64)
-        self._lately: Span | None = None
+        self._recent: Span | None = None
         self._stall: Span | None = None
         self._held_s: float | None = None
         self._held_since_s: float | None = None
@@ -75,7 +75,7 @@ class WheelMonitor:
 
     def learn(self, t_s: float) -> None:
         """Update the recent set points at ``t_s``, when a new span was taken or was due."""
-        self._lately = self._commanded_over(t_s, _MEMORY_S)
+        self._recent = self._commanded_over(t_s, _MEMORY_S)
         self._stall = self._commanded_over(t_s, self._cfg.stall_time_s + _LATENCY_S)
 
     def _commanded_over(self, t_s: float, memory_s: float) -> Span | None:
@@ -107,8 +107,8 @@ class WheelMonitor:
         held its wheels; ``is_late``: it executed an old command; ``is_sparse``: fewer encoder samples than usual.
         """
         t_s = now[0]
-        shortly, stalling, turning = self._shortly.push(now), self._stalling.push(now), self._turning.push(now)
-        self.speed_m_s = 0.0 if shortly is None else max(abs(shortly[1]), abs(shortly[2])) / shortly[0]
+        brief, stalling, turning = self._brief.push(now), self._stalling.push(now), self._turning.push(now)
+        self.speed_m_s = 0.0 if brief is None else max(abs(brief[1]), abs(brief[2])) / brief[0]
         if not is_free:
             self._held_s = t_s
         if not is_held:
@@ -119,25 +119,25 @@ class WheelMonitor:
             self._late_s = t_s
         if is_sparse:
             self._sparse_s = t_s
-        lately = self._commanded(t_s)
+        recent = self._commanded(t_s)
         is_vague = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
-        if lately is not None:
+        if recent is not None:
             limit = self._cfg.runaway_m_s
-            if shortly is not None:
-                self._find_runaway(t_s, shortly, lately, samples, _VAGUE * limit if is_vague else limit)
+            if brief is not None:
+                self._find_runaway(t_s, brief, recent, samples, _VAGUE * limit if is_vague else limit)
             if is_vague and stalling is not None:
-                self._find_runaway(t_s, stalling, lately, samples, limit)
+                self._find_runaway(t_s, stalling, recent, samples, limit)
             if stalling is not None:
                 self._find_stall(t_s, stalling)
-                self._find_creep(now, stalling, lately, samples)
+                self._find_creep(now, stalling, recent, samples)
         if turning is not None:
             self._compare_turns(t_s, turning, _VAGUE if is_vague else 1.0)
 
     def _commanded(self, t_s: float) -> Span | None:
         """Recent set points of the wheels; ``None`` where they are not known."""
-        lately = self._lately
-        if lately is not None and t_s - lately.t_s <= _LATENCY_S:
-            return lately
+        recent = self._recent
+        if recent is not None and t_s - recent.t_s <= _LATENCY_S:
+            return recent
         # The commands since then are not known. If the robot has held its wheels for long enough, none has effect.
         is_held = self._held_since_s is not None and t_s - self._held_since_s >= _MEMORY_S
         return Span(t_s, 0.0, 0.0, 0.0, 0.0) if is_held else None

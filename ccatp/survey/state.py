@@ -187,7 +187,7 @@ class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forb
 
     @property
     def is_awaiting_fix(self) -> bool:
-        """Whether the measurement asked for last, number ``request``, is still wanted."""
+        """Whether the last requested measurement, number ``request``, is still wanted."""
         behaviour = self.behaviour
         return self.mode is MEASURING and isinstance(behaviour, Settling) and behaviour.is_requested
 
