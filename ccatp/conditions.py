@@ -1,10 +1,10 @@
 """THE table of conditions: everything that slows, pauses, holds, returns or stops the robot, one row per condition.
 
-The danger loop finds those of ``DANGER``: of several at once the gravest counts, of equally grave ones the first row.
-Exceptions, for the verdict's cause only: a declared edge keeps it unless a hold or a fault is found, an emergency
-unless a return or a fault is. A mission, its localizer or the main loop find those of ``SURVEY``. What a mission does
-follows from a row's action; of several that apply at once the first in ``Action`` counts. ``docs/alarms.md`` is made of
-these rows.
+The danger loop finds the conditions in ``DANGER``. Of several at once the one with the highest severity counts, then
+the first row. Two exceptions for the verdict's cause: that of a declared edge stays unless a hold or a fault is found;
+that of an emergency stays unless a return or a fault is found. A mission, its localizer or the main loop find the
+conditions in ``SURVEY``. The action of a row decides what a mission does; of several actions the first in ``Action``
+counts. ``docs/alarms.md`` is generated from these rows.
 """
 
 import re
@@ -17,7 +17,7 @@ from ccatp.core import EventCode, Severity, Verdict
 
 
 class Motion(Enum):
-    """What the robot may still do."""
+    """Motion that is still permitted."""
 
     ANY = "anything"
     RETREAT = "away from it"
@@ -26,7 +26,7 @@ class Motion(Enum):
 
 
 class Clear(Enum):
-    """What ends the reaction, once the condition itself is over."""
+    """What ends the reaction after the condition itself has ended."""
 
     AUTO = "by itself"
     AFTER_FIX = "after a fix"
@@ -34,7 +34,7 @@ class Clear(Enum):
 
 
 class Action(Enum):
-    """What is done about a condition, in the order of precedence."""
+    """Reactions to a condition, in the order of precedence."""
 
     EARTHQUAKE = "wheels held, then home"
     FAULT = "fault: held until an operator resumes"
@@ -77,10 +77,10 @@ class Group(StrEnum):
 class Condition:
     """One row.
 
-    ``message``: the cause as it is shown, "{...}" for what varies; ``meaning``: when it is met; ``advice``: what an
-    operator can do. ``severity`` is the verdict's; NONE where event code and permits say it. ``limit``: the key of the
-    configuration after which it is of severity ``escalates_to``. ``full_fans``: the fans give all they can meanwhile.
-    ``retries``: how often it may come again before it is a fault; ``None``: as the configuration says.
+    ``message``: text of the cause, with "{...}" for variable parts; ``meaning``: when it applies; ``advice``: what an
+    operator can do. ``severity``: of the verdict; NONE if event code and permits express it. ``limit``: key of the
+    configuration with the time after which it has the severity ``escalates_to``. ``full_fans``: full fans meanwhile.
+    ``retries``: how often it may repeat before it is a fault; ``None``: as configured.
     """
 
     group: Group
@@ -98,26 +98,26 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """Its constant, in lower case."""
+        """Name of its constant, in lower case."""
         return _NAMES[self].lower()
 
     @property
     def alarm_severity(self) -> Severity:
-        """Severity in the list of alarms: that of an edge or an emergency follows from what is done about it."""
+        """Severity in the list of alarms; for an edge or an emergency it follows from the action."""
         return self.severity or _ALARM_SEVERITY[self.action]
 
     def text(self, **varies: object) -> str:
-        """The cause as it is shown."""
+        """The message with its variable parts."""
         return self.message.format(**varies)
 
     def found(self, signal: str, value: float, limit: float, **varies: str) -> "MonitorFinding":
-        """The condition is met: ``value`` against ``limit``, and what varies in the message."""
+        """The finding that the condition applies: ``value`` against ``limit``; ``varies``: parts of the message."""
         cause = self.text(**varies) if varies else self.message
         return MonitorFinding(self, self.severity, cause, signal, value, limit)
 
 
 class MonitorFinding(NamedTuple):
-    """A condition that is met; ``value`` is in the unit of ``limit``. Severity and cause grow while it lasts."""
+    """A condition that applies; ``value`` in the unit of ``limit``. While it lasts, severity and cause may change."""
 
     condition: Condition
     severity: Severity
@@ -127,12 +127,12 @@ class MonitorFinding(NamedTuple):
     limit: float
 
     def verdict(self, seq: int, t_s: float, code: EventCode) -> Verdict:
-        """That of frame ``seq``: nothing is permitted."""
+        """The verdict on frame ``seq``, which permits no motion."""
         shown = self.cause, self.signal, self.value, self.limit
         return Verdict(seq, t_s, code, *shown, False, False, False, severity=self.severity)
 
 
-# What an action usually goes with; a row may say otherwise.
+# Usual fields of a row by its action; a row may override them.
 inform = partial(Condition, action=Action.INFORM, severity=Severity.INFORM, motion=Motion.ANY, clear=Clear.AUTO)
 slow = partial(Condition, action=Action.SLOW, severity=Severity.SLOW, motion=Motion.ANY, clear=Clear.AUTO)
 wait = partial(Condition, action=Action.PAUSE, severity=Severity.PAUSE, motion=Motion.NONE, clear=Clear.AUTO)
@@ -155,7 +155,7 @@ near = partial(Condition, action=Action.KEEP_AWAY, severity=Severity.NONE, motio
 
 
 class SampleRate(NamedTuple):
-    """How a sensor of the robot link is called, the rate that the daemon needs, and the one without which it holds."""
+    """Name of a sensor of the robot link, the rate that the daemon needs, and the rate below which it holds."""
 
     sensor: str
     least_hz: float
@@ -163,18 +163,18 @@ class SampleRate(NamedTuple):
 
 
 SAMPLE_RATES = {
-    # A reading in every other step of the filter; without any the wheels alone give the turn.
+    # A reading in every other step of the filter; without any, the turn follows from the wheels alone.
     "imu": SampleRate("accelerometer and gyroscope", 20.0, 0.0),
-    # The wheel monitors add up frames of 100 Hz, of which a fifth may be empty; with 20 a second sound wheels "stand".
+    # The wheel monitors sum frames of 100 Hz, a fifth of which may be empty. At 20 Hz working wheels seem to stand.
     "enc": SampleRate("wheel encoders", 80.0, 40.0),
     # Two samples within a gap of 1.2 mm at 0.1 m/s, or at half of that.
     "edge": SampleRate("edge sensors", 200.0, 83.0),
-    # 40 readings within the three seconds of the check; it may be missing, and is not needed afterwards.
+    # 40 readings within the three seconds of the check; optional, and not needed afterwards.
     "gravity": SampleRate("gravity sensors", 14.0, 0.0),
 }
 
 # fmt: off
-# -- sensors that are too slow; first, because wheels and seams would be blamed for it --------------------------------
+# -- sensors that are too slow; first, because they also cause findings about wheels and seams ------------------------
 
 _RATE = "{sensor} deliver {rate} samples/s, at least {least} are needed"
 _FIRMWARE = "Set the rate in the robot's firmware; the sensor and its cable work."
@@ -367,7 +367,7 @@ OBSTACLE_BEHIND = near(Group.BEACONS, "an obstacle behind",
 DANGER: tuple[Condition, ...] = tuple(row for row in list(globals().values()) if isinstance(row, Condition))
 PRECEDENCE = {row: -number for number, row in enumerate(DANGER)}
 
-# == what a mission, its localizer or the main loop finds =============================================================
+# == conditions that a mission, its localizer or the main loop finds ==================================================
 
 BACK_OFFS = fault(Group.EDGES, "at the edge again after {count} back-offs: is an edge sensor dirty?",
     "The same point ends at an edge over and over.", "Clean the sensors, look at the place; `ccatp resume`, or abort.")
@@ -455,13 +455,13 @@ _NAMES = {row: name for name, row in globals().items() if isinstance(row, Condit
 
 @lru_cache(256)
 def condition_of(cause: str) -> Condition | None:
-    """The row of a cause as it is shown; ``None`` for what is no condition."""
+    """The row of a cause by its text; ``None`` if it is of no condition."""
     found, most = None, -1
     for row in _NAMES:
         fixed = re.split(r"{.*?}", row.message)
-        # What lasts or comes again has its duration or count behind the message.
+        # After a message there may be a duration or a number of repetitions.
         pattern = ".*".join(map(re.escape, fixed)) + r"(,? (for|again after) .*|; .*)?"
-        # Of two that match, the row that says more is meant.
+        # Of two rows that match, the longer message counts.
         if (length := sum(map(len, fixed))) > most and re.fullmatch(pattern, cause):
             found, most = row, length
     return found
