@@ -55,7 +55,7 @@ def test_plaza2_started_later(share: float) -> None:
 def test_mrclam7_smoothed() -> None:
     _, track, found = smoothed("mrclam/set7", 1)
     assert found.trajectory_rmse_m is not None
-    assert found.trajectory_rmse_m < 0.12  # the goal, which is one of the mean over the robots
+    assert found.trajectory_rmse_m < 0.08  # with ranges by height as distances 0.12
     assert len(track.beacons) == 15
     assert track.calibration["odometry_delay_s"].value == pytest.approx(0.25, abs=0.1)  # odometry is what was commanded
 
@@ -63,7 +63,17 @@ def test_mrclam7_smoothed() -> None:
 @pytest.mark.slow
 def test_mrclam7_smoothed_mean_of_all_robots() -> None:
     errors = [smoothed("mrclam/set7", robot)[2].trajectory_rmse_m or 9.0 for robot in range(1, 6)]
-    assert sum(errors) / len(errors) < 0.12
+    assert sum(errors) / len(errors) < 0.06
+
+
+@pytest.mark.slow
+def test_mrclam7_filtered_mean_of_all_robots() -> None:
+    runs = [read_run(DATA / "mrclam/set7", None, robot) for robot in range(1, 6)]
+    found = [judge(estimate(run, load_recordings_config(), "ekf-slam"), run) for run in runs]
+    assert sum(one.trajectory_rmse_m or 9.0 for one in found) / len(found) < 0.17
+    assert (
+        0.5 < sum(one.nees.mean if one.nees else 99.0 for one in found) / len(found) < 2.0
+    )  # with depths as distances 4.7
 
 
 @pytest.mark.slow
@@ -71,7 +81,7 @@ def test_mrclam7_landmarks_by_the_fixed_lag_mean_of_all_robots() -> None:
     """Its map rests on what was received up to the end, its alignment on the path of each instant."""
     runs = [read_run(DATA / "mrclam/set7", None, robot) for robot in range(1, 6)]
     errors = [judge(estimate(run, load_recordings_config(), "fixed-lag"), run).beacon_rmse_m or 9.0 for run in runs]
-    assert sum(errors) / len(errors) < 0.10
+    assert sum(errors) / len(errors) < 0.08
 
 
 @pytest.mark.slow
@@ -80,7 +90,7 @@ def test_mrclam3_maps_the_landmarks_without_truth_of_the_path(robot: int) -> Non
     _, _, found = smoothed("mrclam/set3", robot)
     assert found.trajectory_rmse_m is None
     assert found.beacon_rmse_m is not None
-    assert found.beacon_rmse_m < 0.1
+    assert found.beacon_rmse_m < 0.09
 
 
 def test_labyrinth_smoothed() -> None:
