@@ -39,12 +39,12 @@ class Action(Enum):
     EARTHQUAKE = "wheels held, then home"
     FAULT = "fault: held until an operator resumes"
     LOCATE = "hold: wheels held, one fix at rest, then held until it is over"
-    HOLD = "hold: wheels held, a fix, then on by itself"
+    HOLD = "hold: wheels held, a fix, then it continues by itself"
     SLOW = "half the speed"
     RETURN = "home"
     WAIT = "hold: wheels held until no sensor hangs over"
     RETREAT = "back off"
-    PAUSE = "pause: wheels held, goes on by itself"
+    PAUSE = "pause: wheels held, continues by itself"
     KEEP_AWAY = "no motion towards it"
     INFORM = "reported"
 
@@ -181,54 +181,56 @@ _FIRMWARE = "Set the rate in the robot's firmware; the sensor and its cable work
 SENSOR_MUCH_TOO_SLOW = hold(Group.SENSORS, _RATE,
     "Encoders or edge sensors deliver less than half of what is needed. The robot stands.", _FIRMWARE)
 SENSOR_TOO_SLOW = slow(Group.SENSORS, _RATE,
-    "Samples come, and more seldom than needed at full speed. The robot goes on at half its speed.", _FIRMWARE)
+    "The sample rate is lower than needed at full speed. The robot continues at half its speed.", _FIRMWARE)
 
 # -- wheels and encoders ----------------------------------------------------------------------------------------------
 
 ENCODER_BROKEN = hold(Group.WHEELS, "the {side} encoder {what}",
-    "One encoder repeats itself, or gives no values, while the wheel must turn.",
-    "Its cable. The robot is measured and goes on; again and again it is a fault.")
+    "One encoder repeats itself, or gives no values, while the wheel must turn. The robot takes a fix and continues; "
+    "repeated, it is a fault.", "Check its cable.")
 WHEEL_RUNS_AWAY = hold(Group.WHEELS, "the {side} wheel runs away",
-    "It turns faster than commanded.", "Take the robot off: the servo fails.")
+    "It turns faster than commanded.", "Remove the robot: the servo fails.")
 WHEELS_STAND = hold(Group.WHEELS, "both wheels stand, or no encoder counts",
-    "They were commanded to turn. Motor supply, or both encoders.", "The robot's supply; its own log.", retries=1)
+    "They were commanded to turn. The motor supply or both encoders fail.",
+    "Check the robot's supply and its own log.", retries=1)
 ENCODER_COUNTS_NOTHING = hold(Group.WHEELS, "the {side} encoder counts nothing",
-    "The wheel turns by the gyroscope and not by its encoder.", "Its cable, its disc.", retries=1)
+    "By the gyroscope the wheel turns, by its encoder it does not.", "Check the encoder's cable and disc.", retries=1)
 WHEEL_BLOCKED = hold(Group.WHEELS, "the {side} wheel is blocked",
-    "It was commanded to turn and stands still; the gyroscope agrees.", "Look for what is in its way.", retries=1)
+    "It was commanded to turn and stands still; the gyroscope agrees.", "Look for an obstacle.", retries=1)
 WHEEL_CREEPS = hold(Group.WHEELS, "the {side} wheel turns while it is held",
-    "The robot creeps. Fans to their maximum; a fault if it goes on.", "Hold the robot; fans, brake, slope.",
+    "The robot creeps. Fans to their maximum; a fault if it continues.", "Hold the robot; check fans, brake, slope.",
     full_fans=True)
 WHEEL_CREEPS_ON = fault(Group.WHEELS, "the {side} wheel turns while it is held",
-    "The robot has crept for a second. Fans to their maximum.", "Hold the robot; fans, brake, slope.", full_fans=True)
+    "The robot has crept for a second. Fans to their maximum.",
+    "Hold the robot; check fans, brake, slope.", full_fans=True)
 WHEEL_DOES_NOT_STOP = hold(Group.WHEELS, "the {side} wheel turns though it shall stand",
-    "The servo does not come to rest.", "As for a wheel that runs away, if it comes again.")
+    "The servo does not come to rest.", "If it repeats, as for a wheel that runs away.")
 GRIP_LOST = hold(Group.WHEELS, "the robot loses its grip: it slides downhill over its wheels",
     "Accelerometer and gyroscope show a slide along gravity, its wheels do not. Wheels held, fans to their maximum; "
     "a fault if it slides again within `health.retry_window_s`.",
     "Tyres or mirror oily? Too little thrust for the slope: see `ccatp plan`.", full_fans=True, retries=0)
 GRIP_TOO_LITTLE = fault(Group.WHEELS, "too little grip by the creep of turns: the fans do not hold it everywhere",
-    "The friction that turns show, at the start and at each fix after a turn, is less than full thrust can do with.",
+    "The friction measured in turns, at the start and at each fix after a turn, is too small even for full thrust.",
     "Tyres or mirror oily? Clean them, or raise the thrust; `ccatp status` shows the friction. Wrong `robot.tyre_m`?",
     full_fans=True)
 GRIP_LITTLE = slow(Group.WHEELS, "little grip by the creep of turns: less than `robot.thrust_margin`",
-    "The same, and full thrust still holds the robot. More thrust, half the speed.",
-    "As above; it is over when turns creep less.")
+    "The same, but full thrust still holds the robot. More thrust, half the speed.",
+    "As above; it ends when turns creep less.")
 YAW_DISAGREES = hold(Group.SENSORS,
     "gyroscope and wheels disagree about the turn: a wheel slips, or the gyroscope is off",
-    "They disagree by more than slip and errors of scale explain. A fix comes first.",
-    "Wheels or mirror oily? Otherwise the gyroscope.")
+    "They disagree by more than slip and scale errors explain. The robot takes a fix.",
+    "Wheels or mirror oily? Otherwise check the gyroscope.")
 
 # -- fans -------------------------------------------------------------------------------------------------------------
 
 FAN_TOO_LITTLE = fault(Group.FANS, "the {side} fan gives too little",
-    "Not enough to carry with certainty. Held, fans at their maximum.",
+    "Not enough to carry the robot with certainty. Wheels held, fans to their maximum.",
     "Secure the robot by hand before anything else.", full_fans=True)
 FAN_WEAK = go_home(Group.FANS, "the {side} fan gets weak",
-    "It gives less than commanded, and still enough to carry the robot. The robot goes home.",
+    "It gives less than commanded, but enough to carry the robot. The robot goes home.",
     "Replace it; `ccatp run --resume` later.", full_fans=True)
 FAN_REPORTED = fault(Group.FANS, "the robot reports a fault of its {side} fan",
-    "The robot's own word; taken as too little.", "Secure the robot.", full_fans=True)
+    "The robot reports it; handled like too little thrust.", "Secure the robot.", full_fans=True)
 FAN_REPORTED_ON_THE_FLAT = inform(Group.FANS, "the robot reports a fault of its {side} fan",
     "The same where the mirror does not overhang: the robot stands without fans.",
     "Replace it before the robot goes to an overhanging mirror.")
@@ -236,107 +238,109 @@ FAN_REPORTED_ON_THE_FLAT = inform(Group.FANS, "the robot reports a fault of its 
 # -- link and clock ---------------------------------------------------------------------------------------------------
 
 DRIVES_TOO_LATE = pause(Group.LINK, "drives reach the wheels too late",
-    "Commands take so long that the robot is not steered any more: a pause.", "Network.")
+    "Commands take so long that the robot cannot be steered: a pause.", "Check the network.")
 DRIVES_LATE = slow(Group.LINK, "drives reach the wheels late",
-    "Commands take long. Half the speed.", "Network.")
+    "Commands take long. Half the speed.", "Check the network.")
 CLOCK_JUMPED = pause(Group.LINK, "the robot's clock has jumped",
-    "Its times are off by more than `health.clock_jump_s`. The clock's offset is measured again.", "Nothing once.")
+    "Its times are off by more than `health.clock_jump_s`. The clock's offset is measured again.",
+    "Nothing, unless it repeats.")
 FRAMES_LOST = hold(Group.DATA, "frames were lost while the robot may have moved",
-    "A gap in the frames while the robot moved. A fix comes first.", "Network, if it comes often.")
+    "A gap in the frames while the robot moved. The robot takes a fix.", "If it repeats, check the network.")
 LINES_GARBLED = hold(Group.DATA, "lines of the robot were no frames",
     "Several lines in a short time could not be read.",
-    "Network or firmware. `ccatp conformance` reports what the robot sends wrong.")
+    "Check network and firmware. `ccatp conformance` reports what is wrong in the robot's messages.")
 
 # -- edge sensors and inertial unit -----------------------------------------------------------------------------------
 
 EDGE_SENSOR_CHATTERS = hold(Group.SENSORS, "an edge sensor chatters",
-    "It changes many times a second where the map has no edge.", "Clean it; look at its cable.")
+    "It changes many times a second where the map has no edge.", "Clean it; check its cable.")
 EDGE_SENSOR_FLASHES = pause(Group.SENSORS, "an edge sensor went off though nothing moved",
-    "Light fell on it, or it fails.", "Nothing once. Stray light: cover the place.")
+    "Light fell on it, or it fails.", "Nothing, unless it repeats. Stray light: cover the place.")
 EDGE_SENSOR_STAYS_DARK = slow(Group.SENSORS, "an edge sensor went off though nothing moved",
     "It stays off for longer than a pause may last: the edge rule decides, at half the speed.",
     "Clean or replace it. Stray light: cover the place.")
 IMU_LEFT_OUT = slow(Group.SENSORS, "{what}: left out",
-    "Readings of the inertial unit are impossible (stuck, at their limit, a jump). It is left out: wheels alone, at "
-    "half the speed.", "Accuracy suffers. Replace it if it does not come back.")
+    "Readings of the inertial unit are impossible (stuck, at their limit, a jump). It is not used: wheels alone, at "
+    "half the speed.", "The accuracy is lower. Replace it if this does not end.")
 SAMPLES_TOO_FEW = slow(Group.SENSORS, "a sensor gives too few samples",
-    "One sensor is slower than usual. The robot goes on at half its speed.", "The robot's own log.")
+    "One sensor is slower than usual. The robot continues at half its speed.", "See the robot's own log.")
 
 # -- battery ----------------------------------------------------------------------------------------------------------
 
 BATTERY_LOW = go_home(Group.FANS, "the battery has to last for the way home",
-    "The charge suffices for the way home with its reserve, and not for more. The robot goes home.",
+    "The charge is enough for the way home with its reserve, but not for more. The robot goes home.",
     "Charge it; `ccatp run --resume` later.")
 BATTERY_REPORTED = go_home(Group.FANS, "the robot reports a low battery",
-    "The robot's own word. It goes home.", "As above.")
+    "The robot reports it, and goes home.", "As above.")
 
 # -- seams ------------------------------------------------------------------------------------------------------------
 
 EDGE_SENSOR_BLIND = hold(Group.SENSORS, "an edge sensor sees no seams: blind",
-    "It would not see the rim either.", "Clean or replace it before `ccatp resume`.", retries=0)
+    "It would not detect the rim either.", "Clean or replace it before `ccatp resume`.", retries=0)
 SEAM_MISSED = slow(Group.SENSORS, "an edge sensor did not see a seam",
-    "It crossed a seam and said nothing. The robot goes on at half its speed.",
-    "Clean it; the second seam that it misses holds the robot.")
+    "It crossed a seam without a signal. The robot continues at half its speed.",
+    "Clean it; the second missed seam holds the robot.")
 
 # -- what the robot reports of itself ---------------------------------------------------------------------------------
 
 ENCODER_REPORTED = hold(Group.WHEELS, "the robot reports a fault of its {side} encoder",
-    "The robot's own word.", "The robot's own log.")
+    "The robot reports it.", "See the robot's own log.")
 EDGE_REPORTED = hold(Group.WHEELS, "the robot reports a fault of its edge sensors",
-    "The robot's own word.", "The robot's own log.")
+    "The robot reports it.", "See the robot's own log.")
 STALL_REPORTED = hold(Group.WHEELS, "the robot reports that a wheel is blocked",
-    "The robot's own word.", "Look for what is in its way.")
+    "The robot reports it.", "Look for an obstacle.")
 IMU_REPORTED = slow(Group.WHEELS, "the robot reports a fault of its inertial unit",
-    "The robot's own word. Half the speed.", "The robot's own log.")
+    "The robot reports it. Half the speed.", "See the robot's own log.")
 UNKNOWN_REPORTED = inform(Group.WHEELS, "the robot reports a fault that is not known here",
-    "A firmware newer than this program. Reported, and nothing else.", "The robot's manual.")
+    "The firmware is newer than this program. It is only reported.", "See the robot's manual.")
 
 # -- data that are missing or old -------------------------------------------------------------------------------------
 
 NO_FRAME = pause(Group.DATA, "no sensors frame",
-    "Danger has no frame of the robot.", "Is the robot on, the network up? See the link's alarms below.")
+    "The danger loop receives no frames from the robot.",
+    "Is the robot on, the network up? See the link's alarms below.")
 NO_EDGE_SAMPLES = pause(Group.DATA, "no edge samples",
-    "Frames come, without edge sensors.", "The robot's sensor board; its own log.")
+    "Frames arrive without edge samples.", "Check the robot's sensor board and its own log.")
 EDGE_STALE = pause(Group.DATA, "edge samples stale",
-    "Frames come, their edge samples are old.", "The robot's sensor board; its own log.")
+    "Frames arrive with old edge samples.", "Check the robot's sensor board and its own log.")
 ENCODERS_STALE = hold(Group.DATA, "encoder samples stale",
-    "No encoder samples arrive. Held until a fix: it is unknown where the robot moved meanwhile.",
-    "The robot's encoders; if it comes again and again, take the robot off.")
+    "No encoder samples arrive. Held until a fix, because the robot's motion is not known.",
+    "Check the robot's encoders; if it repeats, remove the robot.")
 NO_ESTIMATE = pause(Group.DATA, "no estimate",
     "Main has not reported where the robot is: at the start, or while main is restarted.", "Nothing, unless it lasts.")
 ESTIMATE_STALE = pause(Group.DATA, "estimate stale",
     "Main is too slow or hangs.",
     "Is something else busy on this machine? The supervisor restarts a main that hangs after two seconds.")
 ESTIMATE_NOT_FINITE = pause(Group.DATA, "estimate not finite",
-    "Main's estimate is no number.", "Keep the run directory: this is a defect of ours.")
+    "Main's estimate is not a number.", "Keep the run directory: this is a defect of ccatp.")
 
 # -- edges and emergencies --------------------------------------------------------------------------------------------
 
 LIFTED = hold(Group.EDGES, "all edge sensors off: lifted or fallen",
     "All four edge sensors are off at once.",
     "Look at the robot before anything else. On an overhanging mirror the fans are at their maximum; do not cut their "
-    "power. `ccatp resume` when it stands on the mirror again; it has itself measured first.",
+    "power. `ccatp resume` when it stands on the mirror again; it takes a fix first.",
     limit='health.lifted_limit_s', full_fans=True)
 ALL_OFF = edge(Group.EDGES, "lifted or fallen",
-    "As above, in the first frame of it: code 1, nothing is permitted.", "As above.", action=Action.WAIT,
+    "As above, in its first frame: code 1, no motion is permitted.", "As above.", action=Action.WAIT,
     motion=Motion.NONE)
 EDGE_SENSOR_STAYS_OFF = hold(Group.SENSORS, "an edge sensor stays off though it was moved back and the others are on",
-    "The sensor and no edge, unless one fix, taken at once, shows a seam or the rim there: then it goes on by itself.",
-    "Clean or replace it. `ccatp resume` goes on if it is on again.", action=Action.LOCATE)
+    "The sensor fails, unless a fix, taken at once, shows a seam or the rim there: then the robot continues by itself.",
+    "Clean or replace it. `ccatp resume` continues if it is on again.", action=Action.LOCATE)
 RIM_AHEAD = edge(Group.EDGES, "rim ahead on the map",
-    "A sensor hangs out where the map has the rim.",
-    "Nothing. If it comes again there: is the robot's pose plausible, is the base where the configuration has it?")
+    "A sensor hangs over where the map has the rim.",
+    "Nothing. If it repeats there: is the robot's pose plausible, is the base where the configuration has it?")
 BEYOND_SEAM = edge(Group.EDGES, "further off the panel than the seam is wide",
-    "A sensor has been off for longer than the gap that the map has there.",
+    "A sensor has been off over a longer way than the gap of the map there.",
     "Is a panel missing, or the gap wider than `mirror.panels.gap_mm`?")
 NO_SEAM = edge(Group.EDGES, "off the panel where the map has no seam",
     "A sensor went off in the middle of a panel: a hole, a dark spot, or a pose that is wrong.",
     "Look at the place. A dirty sensor does this everywhere, a wrong pose near seams.")
 OFF_WITHOUT_WHEELS = edge(Group.EDGES, "off the panel while no encoder samples are received",
-    "A sensor is off and it is unknown how far the robot moved meanwhile.",
-    "See the encoder's alarm that comes with it.")
+    "A sensor is off, and the distance that the robot has moved is not known.",
+    "See the encoder's alarm.")
 CENTRE_NEAR_RIM = edge(Group.EDGES, "the robot's centre is close to the rim on the map",
-    "By the pose alone the robot is about to drive over the rim; no sensor has said so yet.",
+    "By its pose the robot is about to drive over the rim; no sensor has gone off yet.",
     "Is the pose plausible? If the robot is elsewhere: `ccatp stop`, carry it to base, remove `checkpoint`, "
     "`--resume`.")
 EARTHQUAKE = shaken(Group.OBSERVATORY, "emergency: earthquake",
@@ -349,20 +353,20 @@ EMERGENCY = go_home(Group.OBSERVATORY, "emergency: {kind}",
 # -- among beacons ----------------------------------------------------------------------------------------------------
 
 RADIO_SILENT = beacon_hold(Group.BEACONS, "no beacon is received",
-    "No reading of a beacon for `danger.radio_timeout_s`.", "The robot's radio; the beacons' supply.")
+    "No reading of a beacon for `danger.radio_timeout_s`.", "Check the robot's radio and the beacons' supply.")
 NO_FRESH_ESTIMATE = beacon_hold(Group.BEACONS, "no fresh estimate",
     "Main has not reported where the robot is for `danger.estimate_timeout_s`.",
     "Is something else busy on this machine?")
 POSITION_UNCERTAIN = beacon_hold(Group.BEACONS, "the position is too uncertain",
-    "Its standard deviation is above `danger.position_sigma_m`. Over when it is below `danger.position_clear_m`.",
-    "Nothing, unless it lasts: beacons that fail.")
+    "Its standard deviation is above `danger.position_sigma_m`. It ends below `danger.position_clear_m`.",
+    "Nothing, unless it lasts: beacons may fail.")
 OBSTACLE_AHEAD = near(Group.BEACONS, "an obstacle ahead",
-    "Something is nearer than `danger.obstacle_m` on the course. Code 1.", "Nothing: it is evaded.")
+    "An echo is nearer than `danger.obstacle_m` on the course. Code 1.", "Nothing: the robot drives around it.")
 TARGET_NEAR = near(Group.BEACONS, "the target is too near",
-    "The radio that is followed is nearer than `danger.target_m` by its level. Code 1.",
+    "By its level, the followed radio is nearer than `danger.target_m`. Code 1.",
     "Nothing: the robot waits until it is farther away.")
 OBSTACLE_BEHIND = near(Group.BEACONS, "an obstacle behind",
-    "Something is nearer than `danger.obstacle_m` behind the robot: no reverse. Code 1.", "Nothing.")
+    "An echo is nearer than `danger.obstacle_m` behind the robot: no reverse. Code 1.", "Nothing.")
 
 DANGER: tuple[Condition, ...] = tuple(row for row in list(globals().values()) if isinstance(row, Condition))
 PRECEDENCE = {row: -number for number, row in enumerate(DANGER)}
@@ -370,83 +374,87 @@ PRECEDENCE = {row: -number for number, row in enumerate(DANGER)}
 # == conditions that a mission, its localizer or the main loop finds ==================================================
 
 BACK_OFFS = fault(Group.EDGES, "at the edge again after {count} back-offs: is an edge sensor dirty?",
-    "The same point ends at an edge over and over.", "Clean the sensors, look at the place; `ccatp resume`, or abort.")
+    "The way to the same point ends at an edge again and again.",
+    "Clean the sensors, look at the place; `ccatp resume`, or abort.")
 STUCK_AT_EDGE = hold(Group.EDGES, "stuck at the edge: no motion away from it is permitted, or none helps",
-    "Sensors bar every way out.", "Look at the robot. It tries again by itself as soon as a sensor is back on.",
+    "The edge sensors bar every direction.",
+    "Look at the robot. It tries again by itself as soon as a sensor is back on.",
     action=Action.WAIT, clear=Clear.AUTO)
 
 NO_FRAME_FOR = wait(Group.DATA, "no sensors frame for {age_s:.2f} s",
-    "Main has no frame of the robot.", "As above.")
+    "The main loop receives no frames from the robot.", "As above.")
 NO_VERDICT = pause(Group.DATA, "no fresh verdict from the danger loop",
-    "Danger is too slow, hangs, or is being restarted.", "As for a stale estimate.")
+    "The danger loop is too slow, hangs, or is being restarted.", "As for a stale estimate.")
 FRAME_LATE = pause(Group.DATA, "a frame was served {late_ms:.0f} ms late (limit {limit_ms:.0f} ms)",
     "This machine was too slow for one frame.",
-    "Nothing once; often: other programs, or no real-time rights (`no real time` in `log.jsonl`).")
+    "Nothing, unless it repeats: other programs, or no real-time rights (`no real time` in `log.jsonl`).")
 FRAMES_OLD = pause(Group.DATA, "frames are {late_ms:.0f} ms old (limit {limit_ms:.0f} ms)",
-    "By the robot's echo of our drives its frames, or our drives, are that long on their way: the network or a queue.",
-    "Network; load of the robot's computer.")
+    "By the robot's echo of the drives, frames or drives are delayed by this time in the network or a queue.",
+    "Check the network and the load of the robot's computer.")
 
 UNATTENDED_FAULT = go_home(Group.FANS,
     "unattended fault: the battery ({charge:.0%}) lasts for little more than the way home",
-    "Held on an overhanging mirror without a reaction of an operator: it goes home by itself, once.",
-    "Look after held robots; a fault is reported every minute.")
+    "Held on an overhanging mirror, and no operator has reacted: it goes home by itself, once.",
+    "Attend to held robots; a fault is reported every minute.")
 FANS_REFUSED = fault(Group.FANS, "fan command refused: {why}; set robot.fan_duty",
     "The robot would fall with the configured duty of its fans.", "Correct the configuration; start again.")
 
 LINK_LOST = wait(Group.LINK, "robot link lost: {reason}",
-    "The connection ended. The robot holds its wheels by itself; it is looked for for `robot.reconnect_timeout_s`.",
-    "Network, robot. After that time the run ends with status 5; `--resume` goes on.", clear=Clear.AFTER_FIX)
+    "The connection ended. The robot holds its wheels by itself; main reconnects for `robot.reconnect_timeout_s`.",
+    "Check network and robot. After that time the run ends with status 5; `--resume` continues it.",
+    clear=Clear.AFTER_FIX)
 FRAMES_BACKWARD = hold(Group.LINK, "time stamps of the frames run backward",
-    "Five in a row. Held.", "The firmware's clock.", limit='health.retries')
+    "Five in a row. The robot is held.", "Check the clock of the firmware.", limit='health.retries')
 SENSOR_BACKWARD = hold(Group.LINK, "time stamps of the {sensor} run backward",
-    "The same of one sensor.", "The firmware's clock.", limit='health.retries')
+    "The same for one sensor.", "Check the clock of the firmware.", limit='health.retries')
 
 LEG_OVERDUE = fault(Group.SURVEY, "the leg to ({x_m:.3f}, {y_m:.3f}) m is overdue: is a wheel blocked or slipping?",
     "It takes many times longer than it should.", "Look at the robot.")
 NO_REST = fault(Group.SURVEY, "the robot does not come to rest: {v_m_s:.4f} m/s, {omega_rad_s:.4f} rad/s",
-    "It stands at a point and still moves.", "Fans that shake, a slope that is slippery.")
+    "It should stand at a point, but moves.", "Shaking fans, or a slippery slope?")
 NO_WAY_ON = fault(Group.SURVEY, "no way on: {why}",
     "From where it stands no safe way leads to the next point.",
     "`ccatp abort`; if there is no way home either, carry it.")
 NO_WAY_HOME = fault(Group.SURVEY, "no way home: {why}",
     "From where it stands no safe way leads to base.", "Carry it to base.")
 TIME_USED_UP = go_home(Group.SURVEY, "the time budget of {budget_s:g} s is used up",
-    "The way home would take what is left of it.", "Nothing; `ccatp run --resume` measures what is left.")
+    "The way home would use the rest of it.", "Nothing; `ccatp run --resume` measures the remaining points.")
 MEASUREMENTS_FAILED = fault(Group.SURVEY, "{count} measurements in a row failed: {why}",
-    "The laser system does not see the puck; the reason stands behind the colon.",
-    "Laser, line of sight, the puck's cleanliness; `ccatp resume`.")
+    "The laser system does not see the puck; the reason is after the colon.",
+    "Check laser, line of sight and cleanliness of the puck; `ccatp resume`.")
 NOT_FOUND = fault(Group.SURVEY, "the robot cannot be found again: {why}",
-    "Its pose is not to be trusted, and no fix determines where it is.", "Laser and line of sight; `ccatp resume`.")
+    "Its pose is not trusted, and no fix determines its place.", "Check laser and line of sight; `ccatp resume`.")
 FRAME_REFUSED = fault(Group.SURVEY, "the laser system sees the robot {distance_m:.2f} m from {place}: {why}",
-    "The first fix, or one in motion, lies where the robot cannot be: the laser system's frame is another one.",
-    "Configured collimators, base and start of the robot.")
+    "A fix at the start or on the way lies where the robot cannot be: the laser system has another frame.",
+    "Check the configured collimators, base and start of the robot.")
 LASER_NOT_READY = wait(Group.SURVEY, "the laser system is not ready (laserready_0)",
-    "Its lasers are not warm. The robot stands at its point until they are; nothing is skipped for it.",
+    "Its lasers are not warm. The robot waits at its point; no point is skipped.",
     "Wait, or look at the laser unit; `ccatp check` shows it as well.")
 LENGTHS_REFUSED = fault(Group.SURVEY, "the laser system's lengths do not lead to the robot's base: {why}",
-    "The lengths of the first fix give no position.", "Configured collimators and base.")
+    "The lengths of the first fix give no position.", "Check the configured collimators and base.")
 FILTER_DIVERGED = hold(Group.SURVEY, "filter: {why}",
-    "The estimate is no Gaussian any more. The pose is frozen; a fix starts it again.",
-    "Keep the run directory if it comes again.", limit='health.retries')
+    "The estimate is not a valid Gaussian any more. The pose is frozen until the next fix.",
+    "If it repeats, keep the run directory.", limit='health.retries')
 
 FRAMES_MISSED = fault(Group.BEACONS, "no frames while the robot moved: put it at its start and start a new mission",
     "The robot booted, or the link was away while it may have moved; the map of the beacons is not kept.",
     "`ccatp stop`, put it at its start, start again.")
 MISSION_TOO_LONG = fault(Group.BEACONS, "the mission takes longer than mission.time_limit_s = {limit_s:g}",
-    "The robot is held where it is.", "`ccatp abort` leads it home; or a longer time in the configuration.")
+    "The robot is held where it is.", "`ccatp abort` sends it home; or configure a longer time.")
 
 FIX_NOT_STORED = fault(Group.STORAGE, "the fix of {point} cannot be stored: {why}",
     "The disk is full or broken, or another program locks the database.",
     "Make room, or end that program; `ccatp resume` measures the point again. Once a write has failed nothing more is "
     "written: `ccatp stop`, then `ccatp run --resume`.")
 SKIP_NOT_STORED = fault(Group.STORAGE, "that {point} is skipped cannot be stored: {why}",
-    "The same of a point that was given up.", "As above.")
+    "The same for a point that is skipped.", "As above.")
 DISK_STALLS = fault(Group.STORAGE, "the disk stalls: {point} is not stored after {time_s:g} s",
-    "The disk does not answer.", "The disk; `ccatp resume` when it is back.")
+    "The disk does not answer.", "Check the disk; then `ccatp resume`.")
 
 OPERATOR = go_home(Group.OBSERVATORY, "operator",
     "An operator called the robot home, or paused it: then it is held.",
-    "`ccatp resume` after a pause; otherwise nothing, a new survey measures what is left.", severity=Severity.NONE)
+    "`ccatp resume` after a pause; otherwise nothing, a new survey measures the remaining points.",
+    severity=Severity.NONE)
 # fmt: on
 
 SURVEY = tuple(row for row in list(globals().values()) if isinstance(row, Condition) and row not in DANGER)

@@ -86,7 +86,7 @@ class FullStateLocalizer(LocalizerBase):
 
     @property
     def innovation(self) -> Innovation | None:
-        """Of the last fix, or None."""
+        """Innovation of the last fix, or None."""
         return self._estimate.innovation
 
     @property
