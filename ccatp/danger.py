@@ -118,11 +118,11 @@ class DangerMonitor(EmergencyRules):
         if not found and missing is None and edges.is_idle and not origin.direction and not self.latch.is_latched:
             self.verdict = verdict = Verdict(seq, sensors.t, _NORMAL, "", "", 0.0, 0.0, True, True, True)
             if board is not None and self._escalation.is_counting:
-                self._escalation.climb(t_s, [])
+                self._escalation.escalate(t_s, [])
         else:
             verdict = self._arbitrate(seq, sensors.t, missing)
             if board is not None:
-                self.found = self._escalation.climb(t_s, [*found, *self._own_findings(missing)])
+                self.found = self._escalation.escalate(t_s, [*found, *self._own_findings(missing)])
                 verdict = self._weigh(verdict, self.found)
             self.verdict = verdict = self.latch.with_emergencies(verdict)
         return verdict

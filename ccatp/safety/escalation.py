@@ -80,7 +80,7 @@ class SeverityEscalation:
         """Whether the last frame had findings."""
         return bool(self._since_s)
 
-    def climb(self, t_s: float, findings: list[MonitorFinding]) -> list[MonitorFinding]:
+    def escalate(self, t_s: float, findings: list[MonitorFinding]) -> list[MonitorFinding]:
         """The findings of a frame with raised severities. An empty list ends all durations."""
         since = self._since_s
         now: dict[str, float] = {}

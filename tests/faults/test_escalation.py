@@ -49,7 +49,7 @@ def test_the_ladder_only_ever_raises(steps: list[tuple[float, list[MonitorFindin
     ladder, t_s = SeverityEscalation(HEALTH), 0.0
     for dt_s, findings in steps:
         t_s += dt_s
-        for before, after in zip(findings, ladder.climb(t_s, findings), strict=True):
+        for before, after in zip(findings, ladder.escalate(t_s, findings), strict=True):
             assert after.severity >= before.severity
             assert after.severity is before.severity or before.severity in DENYING
             assert after.signal == before.signal
@@ -58,9 +58,9 @@ def test_the_ladder_only_ever_raises(steps: list[tuple[float, list[MonitorFindin
 def test_a_pause_becomes_a_hold_and_a_hold_a_fault() -> None:
     ladder, pause = SeverityEscalation(HEALTH), finding(Severity.PAUSE)
     ends = [(0.0, Severity.PAUSE), (HEALTH.pause_limit_s, Severity.HOLD), (HEALTH.hold_limit_s, Severity.FAULT)]
-    assert [ladder.climb(t_s, [pause])[0].severity for t_s, _ in ends] == [severity for _, severity in ends]
-    ladder.climb(40.0, [])
-    assert ladder.climb(41.0, [pause])[0].severity is Severity.PAUSE
+    assert [ladder.escalate(t_s, [pause])[0].severity for t_s, _ in ends] == [severity for _, severity in ends]
+    ladder.escalate(40.0, [])
+    assert ladder.escalate(41.0, [pause])[0].severity is Severity.PAUSE
 
 
 @pytest.mark.parametrize(("gap_s", "last"), [(10.0, Severity.FAULT), (45.0, Severity.HOLD)])
@@ -68,8 +68,8 @@ def test_what_comes_again_and_again_is_a_fault(gap_s: float, last: Severity) -> 
     ladder = SeverityEscalation(HEALTH)
     found = []
     for k in range(HEALTH.retries + 2):
-        found.append(ladder.climb(k * gap_s, [finding(Severity.HOLD)])[0].severity)
-        ladder.climb(k * gap_s + 1.0, [])
+        found.append(ladder.escalate(k * gap_s, [finding(Severity.HOLD)])[0].severity)
+        ladder.escalate(k * gap_s + 1.0, [])
     assert found[:-1] == [Severity.HOLD] * (HEALTH.retries + 1)
     assert found[-1] is last
 

@@ -82,7 +82,7 @@ def test_what_the_robot_says_of_itself_counts(config: Config, mirror: Mirror) ->
 def test_its_row_holds_the_wheels_with_full_fans_until_a_fix_and_another_slide_is_a_fault() -> None:
     assert (GRIP_LOST.motion, GRIP_LOST.clear, GRIP_LOST.full_fans) == (Motion.NONE, Clear.AFTER_FIX, True)
     escalation, slide = SeverityEscalation(CFG.health), GRIP_LOST.found("grip", 0.06, 0.055)
-    found = [escalation.climb(t_s, [slide] if is_sliding else []) for t_s, is_sliding in enumerate((1, 0, 1))]
+    found = [escalation.escalate(t_s, [slide] if is_sliding else []) for t_s, is_sliding in enumerate((1, 0, 1))]
     assert [[one.severity for one in findings] for findings in found] == [[Severity.HOLD], [], [Severity.FAULT]]
 
 
