@@ -99,7 +99,7 @@ class EdgeRule:
             if episode is not None and episode.phase is not EdgePhase.DECLARED and episode.look_ahead():
                 self.declared[i] += 1
         if estimate is not None and self._has_fix(self._odometry, estimate.sigma_m):
-            self._look_again(self._odometry, estimate)
+            self._review_after_fix(self._odometry, estimate)
         if not any(self.episodes) and not self.is_lifted:
             self._odometry = None
 
@@ -137,7 +137,7 @@ class EdgeRule:
         self._vague_m = max(self._vague_m, sigma_m) if is_still and not has_fix else sigma_m
         return has_fix
 
-    def _look_again(self, odometry: Odometry, estimate: EstimateMessage) -> None:
+    def _review_after_fix(self, odometry: Odometry, estimate: EstimateMessage) -> None:
         """Rule (e), after a fix at rest."""
         limits = self._limits
         for i, episode in enumerate(self.episodes):
