@@ -207,7 +207,7 @@ class SeamLines:
         """Drop the edges after a relocation, because their offsets belong to the old pose."""
         self._edges.clear()
 
-    def meet(self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:
+    def edge_of(self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:
         """The edge of a transition, by the state x (n,) at ``t_s``; None if no seam is near."""
         place, (along_x, along_y), _ = self._sensor(transition, t_s, x, slope)
         seam = self._mirror.nearest_seam(*place)
@@ -233,7 +233,7 @@ class SeamLines:
     ) -> tuple[float, FloatArray, float]:
         """Measurement by a transition over ``edge``: ``sensor - edge - offset = 0`` along one axis.
 
-        Returns residual, m, row (1, n) of the model, and variance, m^2. Arguments as in ``meet``.
+        Returns residual, m, row (1, n) of the model, and variance, m^2. Arguments as in ``edge_of``.
         """
         place, speeds, (forward, left, lever) = self._sensor(transition, t_s, x, slope, edge.k)
         late_s = t_s - transition.t_s

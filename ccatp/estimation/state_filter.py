@@ -219,7 +219,7 @@ class SurveyFilter:
     def cross(self, transition: SensorTransition, t_s: float) -> None:
         """Update with a transition of an edge sensor; ``t_s``: time of the state."""
         full, filter_ = self._full, self._filter
-        edge = self._seams.meet(transition, t_s, filter_.mean, self.slope()) if full.use.seams else None
+        edge = self._seams.edge_of(transition, t_s, filter_.mean, self.slope()) if full.use.seams else None
         if edge is None:
             return
 

@@ -69,7 +69,7 @@ class Meeting:
         return Terrain(mirror()).at(float(self.state[X]), float(self.state[Y]))
 
     def meet(self, seams: SeamLines, state: FloatArray | None = None) -> Edge | None:
-        return seams.meet(self.transition, self.late_s, self.state if state is None else state, self.slope())
+        return seams.edge_of(self.transition, self.late_s, self.state if state is None else state, self.slope())
 
 
 @pytest.fixture
