@@ -1,4 +1,4 @@
-"""The map that fits all ranges best: model, sparse damped least squares with a robust loss, covariance, least error."""
+"""The map that fits all ranges best: model, sparse damped least squares with robust loss, covariance, error bound."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,8 +26,8 @@ class MapState(NamedTuple):
 class MapModel:
     """Ranges z = (1 + s) |p_i - p_j| + o and their derivatives.
 
-    The unknowns are the coordinates of loose motes that are not known, a shift of each body and a small rotation about
-    its first mote, then o and s where they are asked for.
+    The unknowns are the unknown coordinates of motes outside bodies, then a shift of each body and a small rotation
+    about its first mote, then o and s if requested.
     """
 
     def __init__(self, network: RangeNetwork, *, with_offset: bool = False, with_scale: bool = False) -> None:
@@ -35,7 +35,7 @@ class MapModel:
         self.with_offset, self.with_scale = with_offset, with_scale
         d = network.dimension
         sizes = [len(body.motes) for body in network.bodies]
-        # The motes of all bodies one after the other, the body of each, and the first mote of that.
+        # All motes of bodies, the body of each, and the first mote of that body.
         self._bound = np.array([mote for body in network.bodies for mote in body.motes], dtype=np.intp)
         self._body_of = np.repeat(np.arange(len(sizes)), sizes)
         self._origin_of = np.repeat(np.array([body.motes[0] for body in network.bodies], dtype=np.intp), sizes)
@@ -56,7 +56,7 @@ class MapModel:
         return MapModel(network, with_offset=self.with_offset, with_scale=self.with_scale)
 
     def state(self, positions_m: FloatArray, offset_m: float = 0.0, scale: float = 0.0) -> MapState:
-        """The state nearest to positions of the motes, shape (n, d): known coordinates in place, bodies made rigid."""
+        """The state nearest to given positions, shape (n, d), with the known coordinates and rigid bodies."""
         known = self.network.known_m
         positions = np.where(np.isnan(known), positions_m, known)
         for body in self.network.bodies:
@@ -64,7 +64,7 @@ class MapModel:
         return MapState(positions, offset_m, scale)
 
     def residuals(self, state: MapState) -> FloatArray:
-        """Measured less computed ranges, shape (m,)."""
+        """Measured minus computed ranges, shape (m,)."""
         distances = directions(state.positions_m, self.network.first, self.network.second)[0]
         return self.network.ranges_m - (1.0 + state.scale) * distances - state.offset_m
 
@@ -103,7 +103,7 @@ class MapModel:
         if self._bound.size:
             shifts, angles = np.split(step[start : self.coordinates].reshape(-1, self._body_size), [d], axis=1)
             half = 0.5 * np.tensordot(angles, self._turns, 1)
-            # Cayley: orthogonal, and right at first order
+            # Cayley transform: orthogonal, and exact to first order
             rotations = np.linalg.solve(np.eye(d) - half, np.eye(d) + half)
             origins = state.positions_m[self._origin_of]
             arms = state.positions_m[self._bound] - origins
@@ -118,28 +118,28 @@ def directions(positions_m: FloatArray, first: IndexArray, second: IndexArray) -
     """Distances of pairs (m,) and unit vectors from the second mote to the first, shape (m, d)."""
     ways = positions_m[first] - positions_m[second]
     distances = np.sqrt(np.einsum("ij,ij->i", ways, ways))
-    # Motes in one place have no direction: a zero row leaves the range out of this step.
+    # Motes at the same point have no direction: a zero row excludes the range from this step.
     return distances, ways / np.maximum(distances, 1e-12)[:, None]
 
 
 def rigidity_matrix(positions_m: FloatArray, first: IndexArray, second: IndexArray) -> csr_array:
-    """Derivatives of the distances of pairs by all coordinates, shape (m, n d)."""
+    """Derivatives of the distances of pairs with respect to all coordinates, shape (m, n d)."""
     d, u = positions_m.shape[1], directions(positions_m, first, second)[1]
     columns = coordinates_of(np.column_stack([first, second]).ravel(), d)
     values = np.concatenate([u, -u], axis=1).ravel()
     return csr_array((values, columns, np.arange(len(u) + 1) * 2 * d), shape=(len(u), positions_m.size))
 
 
-_DENSE = 240  # unknowns up to which dense Cholesky is quicker than sparse LU
-_NULL = 1e-9  # eigenvalues below this share of the largest are directions that no range sees
-_NO_GAIN = 1e-12  # relative drop of the cost that ends the iteration
-_REST_M = 1e-8  # a step whose largest part is shorter ends it, too
+_DENSE = 240  # number of unknowns up to which dense Cholesky is faster than sparse LU
+_NULL = 1e-9  # of the largest eigenvalue; below it no range determines the direction
+_NO_GAIN = 1e-12  # relative decrease of the cost that ends the iteration
+_REST_M = 1e-8  # a step whose largest component is smaller also ends it
 
 
 class MapFitSettings(NamedTuple):
-    """How to fit.
+    """Settings of a fit.
 
-    ``robust_scale``: Cauchy loss: residuals beyond this many sigmas weigh less and less; infinite for least squares.
+    ``robust_scale``: of the Cauchy loss, in sigmas: larger residuals get less weight; infinite for least squares.
     """
 
     robust_scale: float = float("inf")
@@ -152,19 +152,19 @@ class MapFit(NamedTuple):
 
     state: MapState
     cost: float  # sum of the loss, c^2 log(1 + (r / (c sigma))^2), or (r / sigma)^2
-    weights: FloatArray  # what the loss left of each range, 0 to 1, shape (m,)
+    weights: FloatArray  # of each range by the loss, 0 to 1, shape (m,)
     residuals_m: FloatArray  # shape (m,)
     iterations: int
-    is_at_rest: bool  # whether the steps had ended before ``max_iterations``
+    is_at_rest: bool  # whether it converged within ``max_iterations``
 
 
 def fit_map(model: MapModel, start: MapState, settings: MapFitSettings, penalty: FloatArray | None = None) -> MapFit:
     """Minimise the loss of all ranges from a start.
 
     Steps (J^T W J + lambda D) dq = J^T W r (Levenberg 1944, Marquardt 1963) with W = w / sigma^2 and the weights
-    w = 1 / (1 + (r / (c sigma))^2) of the Cauchy loss. A network without known coordinates may shift and turn: the
-    damping keeps it where it started. ``penalty``: weights of the squares of all coordinates, shape (n d,), of a model
-    without bodies and known coordinates.
+    w = 1 / (1 + (r / (c sigma))^2) of the Cauchy loss. A network without known coordinates is free to shift and turn;
+    the damping keeps it near its start. ``penalty``: weights of the squares of all coordinates, shape (n d,); only for
+    a model without bodies and known coordinates.
     """
 
     def judge(state: MapState) -> tuple[float, FloatArray, FloatArray]:
@@ -196,9 +196,9 @@ def fit_map(model: MapModel, start: MapState, settings: MapFitSettings, penalty:
 
 
 def fit_from_afar(model: MapModel, start: MapState, settings: MapFitSettings) -> MapFit:
-    """The same from a start that may be metres off: by least squares first.
+    """``fit_map`` from a start that may be metres off: first by least squares.
 
-    To a robust loss all ranges of a mote that is far from its place are outliers, and nothing pulls it there.
+    For a robust loss all ranges of a mote far from its true position are outliers, so they do not pull it there.
     """
     if not np.isfinite(settings.robust_scale):
         return fit_map(model, start, settings)
@@ -233,10 +233,10 @@ def _solved(
     normal: csr_array | FloatArray, gradient: FloatArray, damping: float, penalty: FloatArray | None
 ) -> FloatArray:
     diagonal = normal.diagonal()
-    # Unknowns that no range sees still get a damping, so that they stay where they are.
+    # Unknowns that no range determines are damped too, so that they do not move.
     more = damping * np.maximum(diagonal, 1e-6 * float(diagonal.max()))
     if penalty is not None:
-        # The same damping for all: scaled by the diagonal, motes of heavy ranges would not turn over.
+        # Equal damping for all: scaled by the diagonal, it would keep motes with heavy ranges from turning over.
         more = damping + penalty
     if isinstance(normal, np.ndarray):
         damped = normal.copy()
@@ -247,12 +247,12 @@ def _solved(
 
 
 def position_covariance(model: MapModel, fit: MapFit) -> tuple[FloatArray, int]:
-    """Covariance of all positions and how many directions of the unknowns no range sees.
+    """Covariance of all positions, and the number of directions of the unknowns that no range determines.
 
-    Where nothing pins the frame, the covariance is that of the map after the rigid motion that brings it nearest to the
+    Without known coordinates, the covariance is that of the map after the rigid motion that brings it nearest to the
     truth (inner constraints of a free network): C = S B N^+ B^T S^T with B = dp/dq, N the normal matrix and S the
-    projection across all rigid motions. Directions without information count as known: look at the second value.
-    Returns covariance (n d, n d), and the number of directions without information, the frame's included.
+    projection that removes all rigid motions. Undetermined directions count as known, so check the second value.
+    Returns covariance (n d, n d), and the number of undetermined directions, including those of the frame.
     """
     normal, _ = _normal(model, fit.state, fit.residuals_m, np.where(fit.weights > 0.5, 1.0, 0.0))
     dense = normal if isinstance(normal, np.ndarray) else normal.toarray()
@@ -268,10 +268,9 @@ def position_covariance(model: MapModel, fit: MapFit) -> tuple[FloatArray, int]:
 
 
 def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, aligned: bool) -> float | None:
-    """sqrt(tr C / n) of some motes, C = (J^T Sigma^-1 J)^-1 at the true places.
+    """Bound sqrt(tr C / n), m, for some motes, with C = (J^T Sigma^-1 J)^-1 at the true positions.
 
-    ``true_m``: places of all motes, shape (n, d). Returns the bound in metres; None where the ranges leave the map free
-    to move.
+    ``true_m``: positions of all motes, shape (n, d). Returns None if the ranges leave the map free to move.
     """
     state = model.state(true_m)
     count = len(model.network.ranges_m)
@@ -283,7 +282,7 @@ def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, al
 
 
 def map_rms_m(covariance_m2: FloatArray, positions_m: FloatArray, motes: Sequence[int], *, aligned: bool) -> float:
-    """Root mean square error that a covariance of all coordinates (n d, n d) expects of some motes.
+    """Expected root mean square error of some motes, by the covariance of all coordinates (n d, n d).
 
     ``positions_m``: shape (n, d).
     """
@@ -302,15 +301,15 @@ _DENIED = 3.0  # chi-squared for each degree of freedom
 class Agreement(NamedTuple):
     """How the ranges fit a map."""
 
-    outlying: tuple[int, ...]  # ranges of which the loss left less than half
-    factor: float  # chi-squared of the others by their degree of freedom: 1 where the sigmas are right
-    is_denied: bool  # whether the others do not fit, or more than half of those to spare are outliers
+    outlying: tuple[int, ...]  # ranges with a weight below one half
+    factor: float  # chi-squared per degree of freedom of the others: 1 if the sigmas are right
+    is_denied: bool  # the others do not fit, or the outliers exceed half the redundant ranges
 
 
 def agreement_of(fit: MapFit, sigmas_m: FloatArray, dof: int) -> Agreement:
-    """How the ranges fit a map. ``sigmas_m``: of its ranges, shape (m,).
+    """How the ranges fit a map. ``sigmas_m``: of the ranges, shape (m,).
 
-    As many outliers as half of those to spare can agree on another map (breakdown point: Rousseeuw 1984).
+    If half the redundant ranges are outliers, they can agree on another map (breakdown point: Rousseeuw 1984).
     """
     is_out = fit.weights < 0.5
     outliers = int(is_out.sum())

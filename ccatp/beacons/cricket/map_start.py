@@ -1,4 +1,4 @@
-"""Places for a fit to begin with: unfolded in more dimensions, trilaterated, drawn, or grown mote by mote."""
+"""Start positions for a map fit: unfolded from more dimensions, drawn at random, or added mote by mote."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -12,21 +12,22 @@ from ccatp.beacons.cricket.trilateration import sphere_crossings
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion
 
-_SPARE = 2  # dimensions more than the map has, in which what is folded can turn over
-# Weights of the spare dimensions one after the other, in units of the median weight of a distance.
+_SPARE = 2  # extra dimensions, in which a folded part of the map can turn over
+# Successive weights of the spare dimensions, in units of the median weight of a distance.
 _SQUEEZES = tuple(np.geomspace(1e-3, 1e3, 7).tolist())
-_SQUEEZED = MapFitSettings(max_iterations=25, damping=1e-2)  # of each squeeze; the last fit of all is left to others
-# Weights that differ by orders of magnitude would freeze the strong ones before the weak ones have turned.
+_SQUEEZED = MapFitSettings(max_iterations=25, damping=1e-2)  # for each weight; the caller makes the final fit
+# Largest weight of a range over the median weight. If weights differed by orders of magnitude, the strong ranges would
+# fix the map before the weak ones have turned it over.
 _HEAVIEST = 25.0
 
 
 def unfolded(network: RangeNetwork, rng: np.random.Generator | None = None) -> FloatArray:
-    """Places of n motes from their ranges, shape (n, d); as ranges do, it leaves frame and mirror open.
+    """Positions of n motes from their ranges, shape (n, d); the frame and the mirror image are arbitrary.
 
-    Classical scaling gives places in d + 2 dimensions (without a generator, which draws them), and weighted least
-    squares on the ranges alone goes on from there, while a weight on the spare dimensions grows until the points lie in
-    d. A map that is folded over in d dimensions often has a way down through the spare ones. ``network``: without
-    bodies and known places.
+    It starts in d + 2 dimensions: from classical scaling, or from random positions if ``rng`` is given. Weighted least
+    squares on the ranges then refines the positions, while a growing weight on the spare dimensions forces the points
+    into d dimensions. A map that is folded in d dimensions can often unfold through the spare ones. ``network``:
+    without bodies and known positions.
     """
     count, d = network.count, network.dimension
     wide = d + _SPARE
@@ -58,24 +59,25 @@ def classical_scaling(distances_m: FloatArray, dimension: int) -> FloatArray:
 
 
 def completed(network: RangeNetwork) -> FloatArray:
-    """All distances, unknown ones as the shortest way along ranges, shape (n, n) (Shang et al., MDS-MAP, 2003)."""
-    # A distance of nought would be no edge.
+    """All distances, unknown ones as the shortest path along ranges, shape (n, n) (Shang et al., MDS-MAP, 2003)."""
+    # A sparse graph takes a weight of zero for a missing edge.
     graph = adjacency(network.count, network.pairs, np.maximum(network.ranges_m, 1e-9))
     return np.asarray(shortest_path(graph, directed=False))
 
 
-_SEEDS = 30  # draws of a first triangle (tetrahedron) before there is taken to be none
-_CROSSINGS = 30  # crossings of spheres that are tried for one mote
-_WIDE = 3.0  # places that were just found are off by more than a range: robust scales that still count as meeting
-_FLAT = 0.05  # height over length of a triangle that is too flat to begin with
+_SEEDS = 30  # attempts to draw a first triangle (tetrahedron)
+_CROSSINGS = 30  # intersections of spheres that are tried for one mote
+_WIDE = 3.0  # factor of the robust scale, because new positions have larger errors than ranges
+_FLAT = 0.05  # height over length, below which a first triangle is too flat
 
 
 def grown(network: RangeNetwork, robust_scale: float, rng: np.random.Generator) -> FloatArray | None:
-    """Places of n motes, nan where d ranges do not reach, shape (n, d); None where there is no triangle to begin with.
+    """Positions of n motes, shape (n, d); nan for motes that cannot be placed, None without a first triangle.
 
-    Least squares lets a wrong range bend the whole map. Here no range is used that is not drawn: d + 1 motes that all
-    know their distances come first; then the mote that most ranges agree on, at the crossing of d spheres that has the
-    least robust cost of all ranges to motes with a place (consensus: Fischler and Bolles 1981).
+    In least squares one wrong range bends the whole map. Here only drawn ranges place a mote. The first d + 1 motes
+    have all their mutual distances measured. Then the mote that most ranges agree on is added, again and again: at the
+    intersection of d spheres with the least robust cost over its ranges to placed motes (consensus: Fischler and Bolles
+    1981).
     """
     means, count, dimension = PairMeans(network), network.count, network.dimension
     table, scale = means.table_m, _WIDE * robust_scale * means.sigma_table_m
@@ -133,14 +135,14 @@ def _crossing(
         drawn = drawn[rng.choice(len(drawn), _CROSSINGS, replace=False)]
     tips = sphere_crossings(anchors[drawn], ranges_m[drawn]).reshape(-1, d)
     missed = (np.linalg.norm(tips[:, None] - anchors[None], axis=2) - ranges_m) / scales_m
-    # 1 for a range that meets the place, nought for one that is far off it.
+    # 1 for a range that fits the position, towards 0 for one that is far off.
     met = (1.0 / (1.0 + missed**2)).sum(axis=1)
     best = int(np.argmax(met))
     return float(met[best]), tips[best]
 
 
 def images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
-    """Places (n, d) moved to those that are known; with the mirror image, where known places or bodies tell them."""
+    """Positions (n, d) moved onto the known ones; also the mirror image, where known positions or bodies can decide."""
     known = np.isfinite(network.known_m).all(axis=1)
     if known.sum() > network.dimension:
         return [best_motion(places_m[known], network.known_m[known], mirrors=True).moved(places_m)]
@@ -150,14 +152,14 @@ def images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
 
 
 def filled(places_m: FloatArray, network: RangeNetwork) -> FloatArray:
-    """Places (n, d) with those that are not known, nan, beside the motes that they have ranges to."""
+    """Positions (n, d); each unknown (nan) one is replaced by a point near the motes that it has ranges to."""
     places, pairs = places_m.copy(), network.pairs
     for _ in range(len(places)):
         is_known = np.isfinite(places[:, 0])
         for mote in np.flatnonzero(~is_known).tolist():
             partners = np.setdiff1d(pairs[(pairs == mote).any(axis=1)], [mote])
             if (near := partners[np.isfinite(places[partners, 0])]).size:
-                # Beside the mean: two motes in one place would have no direction between them.
+                # Not at the mean itself: two motes at the same point have no direction between them.
                 places[mote] = places[near].mean(axis=0) + 1e-3 * (1.0 + mote % 7)
         if np.isfinite(places[:, 0]).sum() == is_known.sum():
             break
@@ -165,7 +167,7 @@ def filled(places_m: FloatArray, network: RangeNetwork) -> FloatArray:
 
 
 def with_bodies(network: RangeNetwork) -> RangeNetwork:
-    """One range for each pair, those of the bodies' shapes among them; nothing else is known."""
+    """The network with one range for each pair; bodies become ranges, known positions are dropped."""
     means = PairMeans(network)
     pairs, ranges, sigmas = [means.pairs], [means.ranges_m], [means.sigmas_m]
     for body in network.bodies:

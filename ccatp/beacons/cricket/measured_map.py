@@ -1,4 +1,4 @@
-"""A map from measured ranges: filter or batch, doubts about it, its error where the truth is known, a report."""
+"""A map from measured ranges by filter or batch, with warnings, the error if the true positions are known, a report."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -35,17 +35,17 @@ from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, best_motion
 
-_SIGNIFICANT = 12.0  # a drop of chi-squared that chance gives one offset in two thousand
-_CHANCE = 1e-4  # that sound ranges of one pair of all disagree as much
-_SCATTER = 1.5  # factor of the sigmas that is worth a word
-_MOST_ADVISED = 200  # motes, between which every pair is considered
-_FOLDS = 5  # sets of motes that are named
+_SIGNIFICANT = 12.0  # decrease of chi-squared by one offset; by chance once in two thousand
+_CHANCE = 1e-4  # probability over all pairs that correct ranges of one pair disagree as much
+_SCATTER = 1.5  # factor of the sigmas above which a warning is given
+_MOST_ADVISED = 200  # largest number of motes for which the next pair is advised: every pair is evaluated
+_FOLDS = 5  # sets of motes that are listed
 _SHAPES = ", or the places of --tags are wrong"
 _IN_SPACE = ", or the motes are not in a plane: --dimension 3 maps them in space"
 
 
 def _disagreeing(network: RangeNetwork) -> Iterator[str]:
-    """A warning of the pair whose own ranges contradict each other most, more than by chance."""
+    """A warning that names the pair whose repeated ranges contradict each other most, if more than by chance."""
     means = PairMeans(network)
     squares = np.bincount(means.pair_of, ((network.ranges_m - means.ranges_m[means.pair_of]) / network.sigmas_m) ** 2)
     chances = chdtrc(np.maximum(np.bincount(means.pair_of) - 1, 1), squares)
@@ -64,7 +64,7 @@ def _disagreeing(network: RangeNetwork) -> Iterator[str]:
 def _doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str]:
     """Warnings of folds, contradictions, scatter and outliers of a batch map.
 
-    ``factor``: of the sigmas, by the residuals.
+    ``factor``: sigmas found from the residuals, over the given ones.
     """
     for fold in found.folds[:_FOLDS]:
         motes = list_names([network.names[mote] for mote in fold.motes])
@@ -89,9 +89,9 @@ def _doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[st
 
 
 def _hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSettings) -> Iterator[str]:
-    """A warning of an offset that the ranges show, where none is estimated.
+    """A warning that the ranges have a common offset, for a map that estimates none.
 
-    ``network``: its ranges, with the sigmas that they were found to have.
+    ``network``: with the estimated sigmas.
     """
     model = MapModel(network, with_offset=True)
     dof = len(network.ranges_m) - model.size
@@ -101,10 +101,10 @@ def _hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSettin
     without, shown = fit_map(MapModel(network), state, settings), fit_map(model, state, settings)
     agreement = agreement_of(shown, network.sigmas_m, dof)
     if found.agreement.is_denied:
-        # An offset may have bent the map too far to be seen from there.
+        # The offset may have bent the map so far that a fit from there does not find it.
         again = map_motes(network, settings, with_offset=True)
         shown, agreement = again.fit, again.agreement
-    # Where the ranges deny the map even so, any unknown more betters it, and means nothing.
+    # If the map with an offset still contradicts its ranges, the better fit proves nothing: any extra unknown helps.
     if without.cost - shown.cost > _SIGNIFICANT and not agreement.is_denied:
         yield (
             f"all ranges look {1e3 * shown.state.offset_m:.0f} mm long in common (chi-squared {without.cost:.0f}, "
@@ -115,7 +115,7 @@ def _hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSettin
 def _left_out_heights(
     option: str, places_m: Mapping[str, tuple[float, ...]], dimension: int, least_m: float
 ) -> Iterator[str]:
-    """A warning of third coordinates that a map in the plane leaves out, where they differ by more than so much."""
+    """A warning that a planar map ignores third coordinates, if these differ by more than ``least_m``."""
     heights_m = [place[2] for place in places_m.values() if len(place) > dimension]
     if heights_m and (spread_m := max(heights_m) - min(heights_m)) > least_m:
         yield (
@@ -125,12 +125,12 @@ def _left_out_heights(
 
 
 def _is_flat(error_m: float | None, places_m: FloatArray) -> bool:
-    """Whether an error expected is larger than the map's least extent, root mean square; places of shape (n, d)."""
+    """Whether the expected error exceeds the least extent of the map (root mean square); positions of shape (n, d)."""
     extents_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False) / np.sqrt(len(places_m))
     return error_m is not None and bool((extents_m[: len(places_m) - 1] < error_m).any())
 
 
-_WIDER = 1e4  # of variances: what a range that is used twice adds by its first use is then a ten-thousandth
+_WIDER = 1e4  # factor of the prior variances: ranges are used twice, and their first use then counts a ten-thousandth
 
 Places = Mapping[str, tuple[float, ...]]
 
@@ -138,7 +138,8 @@ Places = Mapping[str, tuple[float, ...]]
 class MeasuredRanges(NamedTuple):
     """Ranges as they were recorded.
 
-    ``groups``: names of motes that move together, by the name of their pose: tags of a trolley that stood there.
+    ``groups``: for each pose of a trolley, the names of its tags there; they form a rigid body. ``tags``: the tag of
+    each such name.
     """
 
     readings: tuple[MoteRange, ...]
@@ -168,10 +169,10 @@ class _Found(NamedTuple):
 def map_measured(
     cfg: CricketConfig, method: str, file: MeasuredRanges, tags_m: Places | None, truth_m: Places | None
 ) -> MeasuredMap:
-    """Map what a file of ranges holds.
+    """Map the motes of a file of ranges.
 
-    Places of a trolley that stood somewhere are mapped along with the anchors, which are what the result is about.
-    ``method``: ``ekf`` or ``batch``. Raises MappingError: the ranges make no map, or the files do not fit each other.
+    The poses of a trolley are estimated together with the anchors; the result reports only the anchors. ``method``:
+    ``ekf`` or ``batch``. Raises MappingError: the ranges give no map, or the files contradict each other.
     """
     network = _network(cfg, file, tags_m)
     rng = np.random.default_rng(0)
@@ -205,7 +206,7 @@ def map_measured(
         f"leave --{name} out"
         for name in freedom.undetermined
     ]
-    # Derivatives at a place where they vanish: what comes out is large, and means that nothing is known.
+    # If the motes are in line, the derivatives across it vanish. The large error there means only: undetermined.
     if is_thin := _is_flat(bound_m, places) or (found.is_trusted and _is_flat(expected_m, places)):
         shape = "in a line" if network.dimension == 2 else "in a plane"
         warnings.append(f"the motes lie {shape}, or nearly: the ranges do not determine how far each is off it")
@@ -235,7 +236,7 @@ def map_measured(
 def _next_pair(
     names: Sequence[str], places: FloatArray, covariance: FloatArray, sigma_m: float
 ) -> dict[str, Any] | None:
-    """The pair whose range would lessen the expected error most."""
+    """The pair whose range would reduce the expected error most."""
     if len(names) > _MOST_ADVISED:
         return None
     ends = every_pair(np.arange(len(names)))
@@ -283,7 +284,7 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Mirrors) -> _Foun
     warnings = [*_hidden_offset(found, scaled, settings)] if not cfg.batch.estimates_offset else []
     warnings += _doubts(found, network, factor)
     is_denied = found.agreement.is_denied
-    # Of a map that its ranges deny, at least what they miss it by.
+    # If the map contradicts its ranges, its covariance is at least scaled by the residuals.
     inflation = float(((found.fit.residuals_m / scaled.sigmas_m) ** 2).sum()) / found.dof if is_denied else 1.0
     covariance = inflation * found.covariance_m2
     return _Found(found.fit.state, covariance, scaled, found.iterations, not is_denied, tuple(warnings))
@@ -294,7 +295,7 @@ def _filter(cfg: CricketConfig, network: RangeNetwork, first: _Found) -> _Found:
     if _is_flat(map_rms_m(first.covariance_m2, places_m, range(network.count), aligned=True), places_m):
         shape = "in a line" if network.dimension == 2 else "in a plane"
         raise MappingError(f"the motes lie {shape}, or nearly: the filter has no beginning; take --method batch")
-    # The ranges have made the first map already: its shape is a start, and its covariance, taken wide, hardly counts.
+    # The first map was made from the same ranges. So only its shape is used: the prior covariance is made very large.
     mapper = MoteMapper(places_m, _WIDER * first.covariance_m2, cfg.phase2)
     columns = (network.first, network.second, network.ranges_m, network.sigmas_m)
     rows = zip(*(column.tolist() for column in columns), strict=True)

@@ -1,4 +1,4 @@
-"""The batch map from ranges alone: starts, the robust fit, a look for folds, the scale of the sigmas, covariance."""
+"""The batch map from ranges alone: start positions, robust fit, search for folds, scale of the sigmas, covariance."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -24,14 +24,14 @@ from ccatp.beacons.cricket.trilateration import trilaterate
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import RigidMotion, best_motion, rigid_modes
 
-_SURE = 2.0  # a map whose cost per degree of freedom is less needs no other start, and is folded nowhere
-_SAME = 1e-6  # relative difference of costs that are the same minimum's
-_FOUND = 3  # times that the best minimum is found before the search ends
-_FEW = 60  # motes up to which unfolding from drawn places costs little
+_SURE = 2.0  # below this cost per degree of freedom a map has no fold and needs no other start
+_SAME = 1e-6  # relative difference of costs up to which two fits are the same minimum
+_FOUND = 3  # repeats of the best minimum that end the search
+_FEW = 60  # largest number of motes for which unfolding from random positions is cheap
 _DRAWS = 16
-_MANY_DRAWS = 2  # where there are more, and each takes seconds
+_MANY_DRAWS = 2  # with more motes, because each draw takes seconds
 
-_VAGUE = 0.1  # of the ranges: where they scatter by more, whatever is mirrored fits about as well
+_VAGUE = 0.1  # sigma over range above which most mirror images fit about as well as the map
 
 Mirrors = Sequence[tuple[Sequence[int], Sequence[int]]]
 
@@ -47,12 +47,12 @@ class MoteMap(NamedTuple):
     """A map of motes."""
 
     fit: MapFit
-    covariance_m2: FloatArray  # of all coordinates, shape (n d, n d); of the aligned map where nothing pins the frame
+    covariance_m2: FloatArray  # of all coordinates, shape (n d, n d); of the aligned map if no coordinate is known
     dof: int
-    sigma_m: float  # median of the sigmas in the end
+    sigma_m: float  # median of the final sigmas
     iterations: int
     agreement: Agreement
-    free: int  # directions that no range sees, the frame's included
+    free: int  # directions that no range determines, including those of the frame
     folds: tuple[Fold, ...]
 
     @property
@@ -62,11 +62,11 @@ class MoteMap(NamedTuple):
 
     @property
     def variance_factor(self) -> float:
-        """Cost by degree of freedom: 1 where the sigmas are right."""
+        """Cost per degree of freedom: 1 if the sigmas are right."""
         return self.fit.cost / self.dof if self.dof > 0 else 1.0
 
     def doubtful(self, mirrors: Mirrors) -> tuple[int, ...]:
-        """Motes that may be mirrored: by the graph, or because their image fits almost as well."""
+        """Motes that may be mirrored, because the graph allows it or because the mirror image fits almost as well."""
         found = {mote for fold in self.folds for mote in fold.motes}
         return tuple(sorted(found | {mote for _, motes in mirrors for mote in motes}))
 
@@ -77,17 +77,17 @@ def map_motes(
 ) -> MoteMap:  # fmt: skip
     """The map that fits all ranges best.
 
-    A fit goes down to the nearest minimum, and most of them are folded maps. So it begins with the map unfolded from
-    more dimensions (``unfolded``), and its mirror image where bodies distinguish them; then motes that could stand on
-    the other side are tried there (``unfold``). ``start_m``: one more place to begin, shape (n, d), nan where unknown.
-    ``finds_sigma``: the sigmas are right up to a factor, which follows from the residuals (``scaled``).
+    A fit converges to the nearest minimum, and most minima are folded maps. So it starts from the map unfolded from
+    more dimensions (``unfolded``), and from its mirror image if bodies distinguish the two. Then ``unfold`` tries motes
+    on the other side. ``start_m``: an additional start, shape (n, d), nan where unknown. ``finds_sigma``: the sigmas
+    are right up to a common factor, which the residuals determine (``scaled``).
     """
     search = _Search(MapModel(network, with_offset=with_offset, with_scale=with_scale), settings, finds_sigma)
     (_, model, best), is_found = search.best_of(start_m)
     folds: tuple[Fold, ...] = ()
     if float(np.median(model.network.sigmas_m)) < _VAGUE * float(np.median(network.ranges_m)):
         if not is_found and np.isfinite(settings.robust_scale):
-            # To a robust loss a folded map is a good one with a few outliers: first unfold by least squares.
+            # A robust loss accepts a folded map as a good map with a few outliers. So first unfold by least squares.
             plain = settings._replace(robust_scale=float("inf"))
             opened, _, _ = unfold(model, fit_map(model, best.state, plain), plain, mirrors)
             best = min(best, fit_map(model, opened.state, settings), key=_cost)
@@ -113,24 +113,24 @@ def _is_sound(model: MapModel, fit: MapFit) -> bool:
 
 # -- the search -------------------------------------------------------------------------------------------------------
 
-_WIDER = 8.0  # times the robust scale of the first steps from a grown map, whose places are off by several sigmas
+_WIDER = 8.0  # factor of the robust scale in the first steps from a grown map, which is off by several sigmas
 _FIRST_STEPS = 30
-_SCALE_ROUNDS = 15  # of fit and scale
-_SETTLED = 0.01  # relative change of a scale that ends the rounds
-_LEAST_FACTOR = 1e-9  # of sigmas, that is not nought where the ranges are exact
+_SCALE_ROUNDS = 15  # alternations of fit and scale
+_SETTLED = 0.01  # relative change of the scale that ends the alternation
+_LEAST_FACTOR = 1e-9  # of the sigmas; exact ranges would give zero
 
 
 class _Judged(NamedTuple):
-    badness: float  # cost, or scale of the residuals where the sigmas are sought
+    badness: float  # the cost, or the scale of the residuals if the sigmas are estimated
     model: MapModel
     fit: MapFit
 
 
 class _Search:
-    """Fits from one start after the other, until one is sure, or the best was found several times and is sound.
+    """Fits from several starts, until one is certain, or the best was found several times and agrees with its ranges.
 
-    The best is that of least cost. Where the sigmas are sought it is that of least scale of its residuals, fitted with
-    sigmas of that scale (``scaled``).
+    The best fit has the least cost. If the sigmas are estimated, it has the least scale of residuals, and is fitted
+    with sigmas of that scale (``scaled``).
     """
 
     def __init__(self, model: MapModel, settings: MapFitSettings, finds_sigma: bool) -> None:
@@ -139,7 +139,7 @@ class _Search:
         self.iterations = 0
 
     def best_of(self, start_m: FloatArray | None) -> tuple[_Judged, bool]:
-        """The best, and whether it is sure or was found often enough. ``start_m``: as of ``map_motes``."""
+        """The best fit, and whether it is certain or was found often enough. ``start_m``: see ``map_motes``."""
         same = _SETTLED if self._finds_sigma else _SAME
         enough = _FOUND if self._model.network.count <= _FEW else _FOUND - 1
         best, times = self._judge(self._unfolded_fit()), 0
@@ -157,7 +157,7 @@ class _Search:
     def _other_fits(self, start_m: FloatArray | None) -> Iterator[MapFit]:
         network = self._model.network
         if self._model.with_offset or self._model.with_scale:
-            # An offset bends the map that the unfolding begins with: again, with what is known of it by now.
+            # An offset in the ranges bends the unfolded start. So unfold again, with ranges corrected by the estimate.
             yield self._unfolded_fit()
         if start_m is not None:
             yield self._fit(filled(start_m, network))
@@ -168,10 +168,10 @@ class _Search:
             yield self._unfolded_fit(np.random.default_rng(draw))
 
     def _grown_fits(self, draws: int) -> Iterator[MapFit]:
-        """Least squares is drawn towards wrong ranges, and a robust fit from there stays among them; growing is not."""
+        """Fits from grown maps: wrong ranges bend least squares, and a robust fit that starts from there stays bent."""
         robust_scale = self._settings.robust_scale
         wide = self._settings._replace(robust_scale=_WIDER * robust_scale, max_iterations=_FIRST_STEPS)
-        for draw in range(draws):  # the same for the same ranges
+        for draw in range(draws):  # fixed seeds: the same ranges give the same map
             network = self._corrected()
             places = grown(network, robust_scale, np.random.default_rng(draw))
             if places is not None:
@@ -182,7 +182,7 @@ class _Search:
         return self._fit(unfolded(with_bodies(self._corrected()), rng))
 
     def _fit(self, start_m: FloatArray) -> MapFit:
-        # Sigmas that are sought may be far off: they say nothing yet of what is wrong.
+        # Sigmas that are still to be estimated may be far off, so they cannot yet identify outliers.
         how = self._settings._replace(robust_scale=float("inf")) if self._finds_sigma else self._settings
         return self._least([fit_from_afar(self._model, start, how) for start in self._states(start_m)])
 
@@ -203,7 +203,7 @@ class _Search:
         return found.badness <= 1.0 if self._finds_sigma else _is_sure(found.model, found.fit)
 
     def _corrected(self) -> RangeNetwork:
-        """The network with its ranges freed of the offset and the scale that were found."""
+        """The network with its ranges corrected by the estimated offset and scale."""
         network = self._model.network
         if self._best is None:
             return network
@@ -212,10 +212,10 @@ class _Search:
 
 
 def scaled(model: MapModel, fit: MapFit, settings: MapFitSettings) -> tuple[float, MapModel, MapFit]:
-    """The scale of a map's residuals in sigmas; the model with sigmas of that scale, and the map fitted with them.
+    """The scale of a map's residuals in sigmas, the model with sigmas of that scale, and the map fitted with them.
 
-    Residuals of a fit that wrong ranges have bent are all too large, those of a robust fit are not: the scale follows
-    from the fit and the fit from the scale, in turn (S-estimate: Rousseeuw and Yohai 1984).
+    If wrong ranges bend a fit, all its residuals are too large; those of a robust fit are not, but it needs the scale.
+    So scale and fit are computed in turn (S-estimate: Rousseeuw and Yohai 1984).
     """
     factor, at = float("inf"), model
     for _ in range(_SCALE_ROUNDS):
@@ -230,7 +230,7 @@ def scaled(model: MapModel, fit: MapFit, settings: MapFitSettings) -> tuple[floa
 def residual_scale(model: MapModel, fit: MapFit) -> float:
     """Standard deviation of the residuals in sigmas, from their quantile (m + p + 1) / 2.
 
-    Of m residuals p, the number of unknowns, may be nought by the fit alone: the median of the others (Rousseeuw 1984).
+    With p unknowns, the fit alone can make p of m residuals zero. This is the median of the others (Rousseeuw 1984).
     """
     count, size = len(fit.residuals_m), min(model.size, len(fit.residuals_m) - 1)
     place = (count + size + 1) // 2
@@ -241,13 +241,13 @@ def residual_scale(model: MapModel, fit: MapFit) -> float:
 
 # -- folds ------------------------------------------------------------------------------------------------------------
 
-_CLOSE = 9.0  # a mirror image that fits worse by less, in units of chi-squared, is as likely as not to be the truth
+_CLOSE = 9.0  # increase of chi-squared below which a mirror image may be the true map
 _ROUNDS = 10
-_TRIALS = 400  # sets of motes looked at by whole fits; single motes are looked at by themselves
-_CLOSE_BY = 0.25  # of the median range: motes nearer than this to each other are a group
+_TRIALS = 400  # sets of motes that are tested by a fit of the whole map; single motes are tested alone
+_CLOSE_BY = 0.25  # of the median range: motes nearer to each other form a group
 _SINGLE_STEPS = 12
-_SKETCH_STEPS = 15  # of a fit from a mirror image, before it is known to lead anywhere
-_HOPELESS = 20.0  # times the best cost: such a fit ends in a worse fold
+_SKETCH_STEPS = 15  # first steps of a fit from a mirror image; they decide whether it is continued
+_HOPELESS = 20.0  # times the best cost: above it a fit ends in a worse fold
 
 _Doubts = dict[tuple[int, ...], float]
 
@@ -255,11 +255,11 @@ _Doubts = dict[tuple[int, ...], float]
 def unfold(
     model: MapModel, fit: MapFit, settings: MapFitSettings, mirrors: Mirrors = ()
 ) -> tuple[MapFit, int, tuple[Fold, ...]]:
-    """Mirror motes one at a time, and sets of motes across the body or the pair that joins them to the rest.
+    """Mirror single motes, and sets of motes across the body or the pair that joins them to the rest.
 
-    Ranges see a mote whose partners stand nearly in line almost equally well on both sides of it; a fit that began on
-    the wrong side stays there. A change is kept where it lowers the cost; the search ends when none does. Returns the
-    fit, how many were turned, and those whose mirror image fits almost as well.
+    If the partners of a mote are nearly in line, its ranges fit almost equally well on both sides of that line, and a
+    fit that started on the wrong side stays there. A change is kept if it lowers the cost; the search ends when none
+    does. Returns the fit, the number of changes, and the sets whose mirror image fits almost as well.
     """
     turned, near = 0, _Doubts()
     for _ in range(_ROUNDS):
@@ -276,7 +276,7 @@ def _turn_singles(model: MapModel, fit: MapFit, settings: MapFitSettings) -> tup
     network, state = model.network, fit.state
     places, turned, near = state.positions_m.copy(), 0, _Doubts()
     if network.count <= network.dimension + 1 and np.isnan(network.known_m).all():
-        return fit, 0, near  # a triangle (tetrahedron) with one corner mirrored is all of it mirrored: the same map
+        return fit, 0, near  # mirroring one corner of a triangle (tetrahedron) mirrors all of it: the same map
     for mote in network.loose:
         rows = np.flatnonzero((network.first == mote) | (network.second == mote))
         if np.isfinite(network.known_m[mote]).any() or len(rows) < network.dimension:
@@ -309,7 +309,7 @@ def _turn_sets(model: MapModel, fit: MapFit, settings: MapFitSettings, mirrors: 
             places[list(motes)] = image
             start = model.state(places, fit.state.offset_m, fit.state.scale)
             other = fit_from_afar(model, start, settings._replace(max_iterations=_SKETCH_STEPS))
-            # A map that its ranges deny is left for a better one alone: others like it are without number.
+            # If the map contradicts its ranges, only a better map is of interest: similar bad maps are countless.
             if not other.is_at_rest and other.cost <= max(fit.cost, _HOPELESS * (min(fit.cost, sound) + _CLOSE)):
                 other = fit_map(model, other.state, settings)
             gap = other.cost - fit.cost
@@ -340,7 +340,7 @@ def _sets(model: MapModel, fit: MapFit, mirrors: Mirrors) -> Iterator[tuple[Sequ
 
 
 def _groups(model: MapModel, fit: MapFit) -> list[tuple[int, ...]]:
-    # Seen from afar a few motes close together are one point: what is fixed to them turns about them almost freely.
+    # For distant motes, a few motes close together act as one point: a part tied to them can turn almost freely.
     network, places = model.network, fit.state.positions_m
     groups = [body.motes for body in network.bodies]
     if _is_sure(model, fit):
@@ -351,7 +351,7 @@ def _groups(model: MapModel, fit: MapFit) -> list[tuple[int, ...]]:
 
 
 def _mirrored(points: FloatArray, through: FloatArray) -> Iterator[FloatArray]:
-    """Points mirrored across the least, then the next wide extent of others."""
+    """Points mirrored across the axes of least, then second least extent of ``through``."""
     centre = through.mean(axis=0)
     for normal in np.linalg.svd(through - centre)[2][::-1][:2]:
         yield points - 2.0 * ((points - centre) @ normal)[:, None] * normal
@@ -363,14 +363,13 @@ def _mirrored(points: FloatArray, through: FloatArray) -> Iterator[FloatArray]:
 def pinned_map(
     positions_m: FloatArray, covariance_m2: FloatArray, known_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The map moved so that a point and one coordinate of another are as known; in the plane.
+    """The planar map moved so that one mote and one coordinate of another have their known values.
 
-    The error of a map in a frame is its shape's error less the rigid motion that keeps what is known without error:
-    C' = S C S^T, S = I - G (K G)^-1 K, G the rigid motions of the map, K the rows of the known coordinates
-    (S-transform, Baarda 1973).
+    In the new frame the known coordinates have no error: C' = S C S^T, S = I - G (K G)^-1 K, with G the rigid motions
+    of the map and K the rows of the known coordinates (S-transform, Baarda 1973).
 
     Positions (n, 2), covariance of the free map (2 n, 2 n); ``known_m``: both coordinates of one mote and one of
-    another, nan elsewhere, shape (n, 2). Raises ValueError: other coordinates are known than these.
+    another, nan elsewhere, shape (n, 2). Raises ValueError: other coordinates are known.
     """
     is_known = np.isfinite(known_m)
     counts = is_known.sum(axis=1).tolist()
@@ -382,7 +381,8 @@ def pinned_map(
     axis = int(np.flatnonzero(is_known[second])[0])
     way = positions_m[second] - positions_m[first]
     share = float(np.clip((known_m[second, axis] - known_m[first, axis]) / np.hypot(*way), -1.0, 1.0))
-    # Angles of the way, from the known axis, after the turn; the map is nearly in the frame already.
+    # The two possible directions from the first to the second mote; take the smaller turn, since the map is nearly in
+    # the frame already.
     angles = np.array([np.arccos(share), -np.arccos(share)]) + axis * 0.5 * np.pi
     turns = np.angle(np.exp(1j * (angles - np.arctan2(way[1], way[0]))))
     turn = turns[np.argmin(np.abs(turns))]
@@ -396,9 +396,9 @@ def pinned_map(
 
 
 def plain_frame(positions_m: FloatArray) -> RigidMotion:
-    """The motion to a frame of the map's own: the first mote its origin, the second on +x, the third at y > 0.
+    """The motion to a frame with the first mote at the origin, the second on +x, and the third at y > 0.
 
-    ``positions_m``: shape (n, d), of motes that are not all on a line.
+    ``positions_m``: shape (n, d), not all on a line.
     """
     offsets, d = positions_m - positions_m[0], positions_m.shape[1]
     basis = np.zeros((0, d))

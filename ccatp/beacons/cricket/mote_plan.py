@@ -16,8 +16,8 @@ Pairs = tuple[tuple[int, int], ...]
 class MotePlan:
     """The motes of a configuration.
 
-    ``bodies``: the stands, whose shapes are known, in the order of mapping; empty where there are none. ``axes_m``:
-    where A stands and the direction towards B, shape (2, d): what takes the map's frame to the field's.
+    ``bodies``: the stands, whose shapes are known, in the order of mapping. ``axes_m``: position of A and vector from A
+    to B, shape (2, d); they transform the frame of the map to that of the field.
     """
 
     names: tuple[str, ...]
@@ -25,8 +25,8 @@ class MotePlan:
     anchors: tuple[int, ...]
     bodies: tuple[RigidBody, ...]
     axes_m: FloatArray
-    phase1_pairs: Pairs  # pairs that are measured in phase 1
-    phase2_pairs: Pairs  # pairs that phase 2 goes through
+    phase1_pairs: Pairs  # measured in phase 1
+    phase2_pairs: Pairs  # measured in phase 2
     surveyed_m: FloatArray  # coordinates that phase 2 takes as known, nan elsewhere, shape (n, d)
 
     @property
@@ -36,7 +36,7 @@ class MotePlan:
 
     @property
     def mapped(self) -> tuple[int, ...]:
-        """The motes that the map is for: all but the anchors."""
+        """All motes but the anchors."""
         return tuple(mote for mote in range(len(self.names)) if mote not in self.anchors)
 
 
@@ -50,7 +50,7 @@ def network_plan(cfg: CricketConfig) -> MotePlan:
         bodies.append(RigidBody(name, tuple(range(start, start + size)), local_m))
     heads = [body.motes[0] for body in bodies]
     places = np.array(list(cfg.anchors.values()), dtype=np.float64)
-    # A to B, both to the first network, then all of a network to all of the next.
+    # A to B, both to the first stand, then all motes of a stand to all of the next.
     phase1_pairs = [anchors, *product(anchors, bodies[0].motes)]
     for before, after in pairwise(bodies):
         phase1_pairs += product(before.motes, after.motes)
@@ -72,7 +72,7 @@ def network_plan(cfg: CricketConfig) -> MotePlan:
 
 
 def loose_plan(cfg: CricketConfig, names: tuple[str, ...]) -> MotePlan:
-    """The plan of motes by themselves: every pair in reach is measured and used."""
+    """The plan of motes without stands: every pair in reach is measured and used."""
     count, d = len(names), cfg.dimension
     pairs = tuple(combinations(range(count), 2))
     nowhere = np.full((count, d), np.nan)
@@ -82,7 +82,7 @@ def loose_plan(cfg: CricketConfig, names: tuple[str, ...]) -> MotePlan:
 def head_pairs(count: int, programme: str) -> list[tuple[int, int]]:
     """Pairs of stands that measure each other in phase 2.
 
-    ``programme``: ``zigzag``: each with the next; ``adjacent``: and with the one after it; ``all``.
+    ``programme``: ``zigzag``: each with the next; ``adjacent``: also with the one after the next; ``all``: every pair.
     """
     if programme == "all":
         return list(combinations(range(count), 2))

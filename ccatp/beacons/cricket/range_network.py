@@ -1,4 +1,4 @@
-"""Motes and the ranges between them, checked; ranges from delays of ultrasonic pulses; one mean range for each pair."""
+"""Motes and the checked ranges between them; ranges from delays of ultrasonic pulses; the mean range of each pair."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ COLDEST_C, HOTTEST_C = -60.0, 80.0  # beyond, a thermometer is broken
 
 
 class TdoaError(ValueError):
-    """A delay or a temperature that no range can be made of."""
+    """An impossible delay or temperature."""
 
 
 class MoteRange(NamedTuple):
@@ -38,31 +38,31 @@ _SHOWN = 6  # names in a message
 
 
 class MappingError(CcatpError):
-    """Ranges of which no map can be made."""
+    """Ranges that give no map."""
 
     exit_status = ExitStatus.USAGE
 
 
 @dataclass(frozen=True, slots=True)
 class RigidBody:
-    """Motes whose places relative to each other are known: a network on its stand, tags on a trolley."""
+    """Motes whose positions relative to each other are known: motes of a stand, tags on a trolley."""
 
     name: str
     motes: tuple[int, ...]
-    local_m: FloatArray  # their places in the body's own frame, shape (k, d)
+    local_m: FloatArray  # positions in the frame of the body, shape (k, d)
 
     def motion(self, positions_m: FloatArray) -> RigidMotion:
-        """From its own frame to where its motes stand best at places of all motes, shape (n, d)."""
+        """The motion that fits the body best to the positions of its motes; positions of all motes, shape (n, d)."""
         return best_motion(self.local_m, positions_m[list(self.motes)])
 
     def placed(self, positions_m: FloatArray) -> FloatArray:
-        """Its motes there, as they are known to stand relative to each other, shape (k, d)."""
+        """Positions of its motes after that motion, with the known shape, shape (k, d)."""
         return self.motion(positions_m).moved(self.local_m)
 
 
 @dataclass(frozen=True, slots=True)
 class RangeNetwork:
-    """A graph of ranges. ``first``, ``second``: ends of each of the m ranges, indices of motes, shape (m,)."""
+    """A graph of ranges. ``first``, ``second``: indices of the two motes of each range, shape (m,)."""
 
     names: tuple[str, ...]
     dimension: int  # d, 2 or 3
@@ -75,12 +75,12 @@ class RangeNetwork:
 
     @property
     def count(self) -> int:
-        """N, the number of motes."""
+        """Number n of motes."""
         return len(self.names)
 
     @property
     def pairs(self) -> IndexArray:
-        """Ends of each range, the smaller index first, shape (m, 2)."""
+        """The two motes of each range, the smaller index first, shape (m, 2)."""
         return np.sort(np.column_stack([self.first, self.second]), axis=1)
 
     @property
@@ -99,12 +99,12 @@ def build_network(
     *,
     is_whole: bool = True,
 ) -> RangeNetwork:
-    """The graph of some ranges, checked.
+    """The checked graph of some ranges.
 
-    ``names``: the motes in their order; those of the readings, as they come, if ``None``. ``known_m``: known
-    coordinates, nan elsewhere, shape (n, d). Raises MappingError: a range names a mote that is not among ``names``, is
-    from a mote to itself, negative or not finite, or has no positive sigma; there are no ranges, fewer than two motes,
-    or the motes fall apart though the graph ``is_whole``.
+    ``names``: the motes in order; ``None``: those of the readings, in order of appearance. ``known_m``: known
+    coordinates, nan elsewhere, shape (n, d). ``is_whole``: require a connected graph. Raises MappingError: a range
+    names a mote that is not in ``names``, is from a mote to itself, negative or not finite, or has no positive sigma;
+    there are no ranges or fewer than two motes; or the graph is not connected as required.
     """
     rows = list(readings)
     if names is None:
@@ -130,7 +130,7 @@ def build_network(
 
 
 def graph_pairs(network: RangeNetwork) -> IndexArray:
-    """Pairs whose distance is known or measured, each once and in order, shape (e, 2): ranges, and pairs of a body."""
+    """Sorted unique pairs whose distance is measured, or known within a body, shape (e, 2)."""
     bodies = [every_pair(np.array(body.motes, dtype=np.intp)) for body in network.bodies]
     return np.unique(np.sort(np.concatenate([network.pairs, *bodies]), axis=1), axis=0)
 
@@ -142,30 +142,30 @@ def every_pair(motes: IndexArray) -> IndexArray:
 
 
 def coordinates_of(motes: Sequence[int] | IndexArray, dimension: int) -> IndexArray:
-    """Where the coordinates of some motes (k,) stand among those of all, shape (k d,)."""
+    """Indices of the coordinates of some motes (k,) in the vector of all coordinates, shape (k d,)."""
     return (np.asarray(motes, dtype=np.intp)[:, None] * dimension + np.arange(dimension)).ravel()
 
 
 def adjacency(count: int, pairs: IndexArray, weights: FloatArray | None = None) -> csr_array:
-    """The graph of some pairs (e, 2), with weights (e,) or ones, each in one direction; shape (n, n)."""
+    """The graph of some pairs (e, 2) with weights (e,) or ones, one direction each, shape (n, n)."""
     values = np.ones(len(pairs)) if weights is None else weights
     return coo_array((values, (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
 
 
 def components(count: int, pairs: IndexArray) -> IndexArray:
-    """The number of the connected part that each vertex is in, shape (n,)."""
+    """The number of the connected component of each vertex, shape (n,)."""
     return np.asarray(connected_components(adjacency(count, pairs), directed=False)[1], dtype=np.intp)
 
 
 def sides(count: int, pairs: IndexArray, without: Sequence[int]) -> list[tuple[int, ...]]:
-    """The connected parts of the vertices that are left without some."""
+    """The connected components that remain when some vertices are removed."""
     labels = components(count, pairs[~np.isin(pairs, without).any(axis=1)])
     labels[list(without)] = -1
     return [tuple(np.flatnonzero(labels == label).tolist()) for label in np.unique(labels[labels >= 0])]
 
 
 def list_names(names: Sequence[str]) -> str:
-    """The first few of some names, and how many there are more."""
+    """The first few names, and the number of the others."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
 
@@ -185,7 +185,7 @@ def _check_row(row: MoteRange, index: dict[str, int]) -> None:
 
 
 def _check_connected(network: RangeNetwork) -> None:
-    # Motes whose places are known are connected without any range.
+    # Motes with known positions are connected without any range.
     known = np.flatnonzero(np.isfinite(network.known_m).all(axis=1))
     linked = np.concatenate([graph_pairs(network), np.column_stack([known[:-1], known[1:]])])
     labels = components(network.count, linked)
@@ -200,10 +200,10 @@ def _check_connected(network: RangeNetwork) -> None:
 
 
 class PairMeans:
-    """Ranges by pair, r = sum(r_i / sigma_i^2) / sum(1 / sigma_i^2).
+    """Mean range of each pair, r = sum(r_i / sigma_i^2) / sum(1 / sigma_i^2).
 
-    ``pairs``: each once, the smaller index first, shape (e, 2). ``pair_of``: of each range, shape (m,). ``ranges_m``,
-    ``sigmas_m``: of the means, shape (e,). ``table_m``, ``sigma_table_m``: the same between all motes in either order,
+    ``pairs``: unique, the smaller index first, shape (e, 2). ``pair_of``: index of the pair of each range, shape (m,).
+    ``ranges_m``, ``sigmas_m``: of the means, shape (e,). ``table_m``, ``sigma_table_m``: the same as symmetric tables,
     nan without a range, shape (n, n).
     """
 
@@ -220,7 +220,7 @@ class PairMeans:
             self.table_m[i, j], self.sigma_table_m[i, j] = self.ranges_m, self.sigmas_m
 
 
-_MEDIAN_COST = np.sqrt(np.pi / 2.0)  # of the median's standard deviation against the mean's, for normal noise
+_MEDIAN_COST = np.sqrt(np.pi / 2.0)  # standard deviation of the median over that of the mean, for normal noise
 
 
 def pair_range(
@@ -229,9 +229,9 @@ def pair_range(
     """The range of a pair from its readings, d = c(T) (t_2 - t_1), Patil et al. eq. 1.
 
     The speed of sound is that of an ideal gas, c = c_0 sqrt(T / T_0), T in kelvin; the radio message takes no time.
-    sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repeating lessens the noise of a reading, not what a wrong
-    thermometer does, dc/c = dT / (2 T). ``delays_s``: pulse after message, one for each reading, shape (n,), n >= 1.
-    Raises TdoaError: a delay or a temperature that none can be.
+    sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repetition reduces the noise of a reading, but not the error of the
+    thermometer, dc/c = dT / (2 T). ``delays_s``: from message to pulse, one for each reading, shape (n,), n >= 1.
+    Raises TdoaError: an impossible delay or temperature.
     """
     air, ranging, count = cfg.air, cfg.ranging, len(delays_s)
     delay_s = float(np.median(delays_s) if ranging.combine == "median" else np.mean(delays_s))

@@ -1,4 +1,4 @@
-"""What ranges can determine: free directions by name, and whether several maps fit equally well (global rigidity)."""
+"""What the ranges determine: the free directions, and whether several maps fit equally well (global rigidity)."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -21,33 +21,33 @@ from ccatp.beacons.cricket.range_network import (
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import rigid_modes
 
-_NULL = 1e-10  # of the largest eigenvalue: no range sees the direction
-_STILL = 1e-6  # of the fastest mote: a mote that does not move
+_NULL = 1e-10  # of the largest eigenvalue; below it no range determines the direction
+_STILL = 1e-6  # of the fastest speed; below it a mote does not move
 _AXES = ("x", "y", "z")
 
 
 class Freedom(NamedTuple):
-    """Directions of the unknowns that no range sees, to first order."""
+    """Directions of the unknowns that no range determines, to first order."""
 
     unknowns: int
     rank: int
-    frame: tuple[str, ...]  # names of rigid motions of the whole map that are free
-    flexes: tuple[str, ...]
-    undetermined: tuple[str, ...]  # what of offset and scale cannot be separated from the map
+    frame: tuple[str, ...]  # free rigid motions of the whole map
+    flexes: tuple[str, ...]  # free motions of a part of the map against the rest
+    undetermined: tuple[str, ...]  # "offset" or "scale", if it cannot be separated from the map
 
     @property
     def deficiency(self) -> int:
-        """Free directions beyond the frame's."""
+        """Number of free directions beyond those of the frame."""
         return self.unknowns - self.rank - len(self.frame)
 
     @property
     def lines(self) -> list[str]:
-        """Those beyond the frame's by name."""
+        """Descriptions of the free directions beyond those of the frame."""
         return [*self.flexes, *(f"range {name}: the map takes it up" for name in self.undetermined)]
 
 
 def generic_state(model: MapModel, rng: np.random.Generator) -> MapState:
-    """Motes anywhere: what holds there holds for almost all places, so it can be said before any is known."""
+    """Motes at random positions: their rigidity is that of almost all positions, so none needs to be known."""
     network = model.network
     places = rng.standard_normal((network.count, network.dimension))
     sizes = [float(np.abs(body.local_m).max()) or 1.0 for body in network.bodies]
@@ -55,7 +55,7 @@ def generic_state(model: MapModel, rng: np.random.Generator) -> MapState:
         turn = np.linalg.qr(rng.standard_normal((network.dimension, network.dimension)))[0]
         if np.linalg.det(turn) < 0.0:
             turn[:, 0] = -turn[:, 0]
-        # Bodies as large as the rest, so that rounding does not hide what they determine.
+        # Distances comparable to the size of the bodies, so that rounding does not hide what the bodies determine.
         places[list(body.motes)] = places[body.motes[0]] * 3.0 * size + body.local_m @ turn.T
     places[list(network.loose)] *= 3.0 * max(sizes, default=1.0 / 3.0)
     return model.state(places)
@@ -75,9 +75,9 @@ def find_freedom(model: MapModel, state: MapState) -> Freedom:
 
 
 def _largest_rigid_part(moves: FloatArray, points: FloatArray) -> list[int]:
-    """Motes whose distances stay in every free direction (n d, k); points of shape (n, d)."""
+    """Motes whose mutual distances no free direction (n d, k) changes; points of shape (n, d)."""
     count, d = points.shape
-    # One combination of all directions, with weights that no accident makes cancel.
+    # One combination of all directions, with weights that do not cancel by accident.
     mixed = (moves @ np.sin(1.0 + np.arange(moves.shape[1]))).reshape(count, d)
     scale = float(np.abs(mixed).max() * np.abs(points).max())
     offsets, rates = points[:, None] - points[None], mixed[:, None] - mixed[None]
@@ -97,7 +97,7 @@ def _largest_rigid_part(moves: FloatArray, points: FloatArray) -> list[int]:
 
 
 def _null_space(model: MapModel, state: MapState) -> FloatArray:
-    """Orthonormal basis of the unknowns' directions without any effect, shape (size, k)."""
+    """Orthonormal basis of the directions of the unknowns that change no range, shape (size, k)."""
     J = model.jacobian(state).toarray()
     columns = np.sqrt((J**2).sum(axis=0))
     columns[columns == 0.0] = 1.0
@@ -110,7 +110,7 @@ def _frame(moves: FloatArray, points: FloatArray) -> tuple[str, ...]:
     if moves.shape[1] == 0:
         return ()
     d, basis, modes = points.shape[1], np.linalg.qr(moves)[0], rigid_modes(points)
-    # Cosines of the angles between both spaces: 1 for what they share.
+    # Cosines of the principal angles between the two spaces: 1 for a common direction.
     shared = int((np.linalg.svd(basis.T @ modes, compute_uv=False) > 1.0 - 1e-7).sum())
     is_free = np.linalg.norm(basis.T @ modes[:, :d], axis=0) > 1.0 - 1e-7  # the first modes are translations
     names = [f"translation along {_AXES[axis]}" for axis in np.flatnonzero(is_free)]
@@ -122,7 +122,7 @@ def _flexes(moves: FloatArray, points: FloatArray, network: RangeNetwork) -> tup
     count, d = points.shape
     base = _largest_rigid_part(moves, points)
     at = coordinates_of(base, d)
-    # Take from each direction the rigid motion that its base makes.
+    # Subtract from each direction the rigid motion of its base.
     rigid = rigid_modes(points)
     moves = moves - rigid @ np.linalg.lstsq(rigid[at], moves[at], rcond=1e-9)[0]
     U, singular, _ = np.linalg.svd(moves, full_matrices=False)
@@ -150,28 +150,28 @@ def _echelon(rows: FloatArray, order: IndexArray) -> list[FloatArray]:
 
 
 _FOLD_OVER_NULL = 1e-9
-_NAMED = 800  # motes up to which pairs that part the graph are looked for
+_NAMED = 800  # largest number of motes for which separating pairs are searched
 _SHOWN = 8
 
 
 class FoldOver(NamedTuple):
-    """What may fold.
+    """Which parts of the map may fold.
 
     ``mirrors``: (separator, motes): these motes may be mirrored across the line (plane) through the separator.
     """
 
-    is_unique: bool  # whether almost all places give a map that is the only one, up to a rigid motion and the mirror
+    is_unique: bool  # for almost all positions only one map fits, up to a rigid motion and a mirror image
     mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
     warnings: tuple[str, ...]
 
 
 def find_fold_over(network: RangeNetwork, rng: np.random.Generator) -> FoldOver:
-    """Test generic global rigidity, and name what can be mirrored where it fails.
+    """Test generic global rigidity; if it fails, list the motes that can be mirrored.
 
     A graph of n > d + 1 vertices is generically globally rigid in d dimensions if and only if a random equilibrium
     stress of a random framework has a stress matrix of rank n - d - 1 (Connelly 2005; Gortler, Healy and Thurston
-    2010). In the plane that is: three-connected, and rigid without any one range (Jackson and Jordan 2005). The pairs
-    of a body, and of motes whose places are known, count as measured.
+    2010). In the plane this means: three-connected, and rigid without any one range (Jackson and Jordan 2005). Pairs of
+    a body and pairs of motes with known positions count as measured.
     """
     pairs = _all_pairs(network)
     count, d = network.count, network.dimension
@@ -180,7 +180,7 @@ def find_fold_over(network: RangeNetwork, rng: np.random.Generator) -> FoldOver:
     single, rank = _stress(pairs, rng.standard_normal((count, d)), rng)
     if count > d + 1 and rank == count - d - 1:
         return FoldOver(True, (), ())
-    # The same motes may hang on many pairs, one of which is a mote they all turn about: once is enough.
+    # The same motes may have several separators; one is enough.
     mirrors = tuple({motes: (separator, motes) for separator, motes in _mirrors(pairs, count, d)}.values())
     measured = set(map(tuple, network.pairs.tolist()))
     single_pairs = [pair for pair in single.tolist() if tuple(pair) in measured]
@@ -196,13 +196,13 @@ def _all_pairs(network: RangeNetwork) -> IndexArray:
 
 
 def _stress(pairs: IndexArray, points: FloatArray, rng: np.random.Generator) -> tuple[IndexArray, int]:
-    """Pairs without which something moves, and the rank of a random stress matrix."""
+    """Pairs whose removal makes the graph flexible, and the rank of a random stress matrix."""
     count = len(points)
     i, j = pairs.T
     R = rigidity_matrix(points, i, j)
     values, vectors = np.linalg.eigh((R.T @ R).toarray())
     seen = values > _FOLD_OVER_NULL * values[-1]
-    # Orthonormal basis of the column space of R; what a random vector has across it is an equilibrium stress.
+    # Orthonormal basis of the column space of R; the part of a random vector orthogonal to it is an equilibrium stress.
     columns = np.asarray(R @ (vectors[:, seen] / np.sqrt(values[seen])))
     is_single = (columns**2).sum(axis=1) > 1.0 - 1e-7
     draw = rng.standard_normal(len(pairs))
@@ -232,7 +232,7 @@ def _mirrors(pairs: IndexArray, count: int, d: int) -> Iterator[tuple[tuple[int,
 
 
 def _cut_vertices(pairs: IndexArray, count: int, without: int) -> list[int]:
-    """Vertices that part the graph once ``without`` is gone (low points: Hopcroft and Tarjan 1973)."""
+    """Cut vertices of the graph without ``without`` (low points: Hopcroft and Tarjan 1973)."""
     kept = pairs[(pairs != without).all(axis=1)]
     graph = adjacency(count, kept)
     low, cuts, left = np.full(count, -1), set[int](), set(range(count)) - {without}

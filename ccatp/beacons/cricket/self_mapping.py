@@ -1,4 +1,4 @@
-"""Phase 2 of self-mapping: an extended Kalman filter over distances between motes, and the stands that it completes."""
+"""Phase 2 of self-mapping: an extended Kalman filter on distances between motes, and the completed stands."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -13,9 +13,9 @@ from ccatp.config.beacon_models import BatchConfig, CricketConfig, PhaseTwoConfi
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import EkfSlam, Update
 
-_STRAIGHT = 0.01  # share of the variance of a range up to which its curvature does not matter
-_CURVED = 2  # times that all pairs are taken together: how far the map is from straight depends on its errors
-_POOLED = 80  # pairs up to which all of them are linearised together after each reading
+_STRAIGHT = 0.01  # share of the variance of a range below which the second-order term is negligible
+_CURVED = 2  # joint updates of all pairs: the second-order term depends on the errors of the map
+_POOLED = 80  # largest number of pairs for which all are linearised together after each reading
 _DIRECTION_M = 1e-9  # motes nearer than this have no direction between them
 
 
@@ -23,19 +23,18 @@ _OFFSET_SIGMA_M, _SCALE_SIGMA = 0.5, 0.05  # priors of a common offset and scale
 
 
 class MoteMapper:
-    """The filter of Patil et al., eqs 18 to 38: motes stand still, each distance corrects the places of both ends.
+    """The filter of Patil et al., eqs 18 to 38: motes are static; each distance corrects the positions of both ends.
 
-    Where pairs determine little, the map wanders along what they leave free, and a filter that takes each new reading
-    of a pair along a new line of sight believes to have seen that too. With ``pools`` the posterior is computed from
-    the prior and the mean ranges of all pairs, linearised together (Bell and Cathey 1993), so that repeats teach
-    nothing but the length of a line. Beyond ``_POOLED`` pairs, that costs too much, each reading is filtered as it
-    comes.
+    If the pairs determine little, the map drifts along the free directions. Each new reading of a pair is then
+    linearised along a new line of sight, and the filter gains false information about these directions. With ``pools``
+    the posterior is computed from the prior and the mean ranges of all pairs, linearised together (Bell and Cathey
+    1993), so that repeats improve only the length of a line. Beyond ``_POOLED`` pairs this costs too much, and each
+    reading is filtered on arrival.
 
     z = (1 + s) |p_i - p_j| + o;  H has the unit vector from j to i at i, its negative at j, distance and 1 at s and o.
-    What is known has neither variance nor covariance; the prior of all else is the caller's, and is conditioned on what
-    is known. Positions (n, d), covariance (n d, n d); ``known_m``: coordinates that are known, nan elsewhere, shape
-    (n, d). ``batch``: what it estimates of offset and scale, the filter estimates, too. Raises MappingError: shapes
-    that do not fit, or a place that is missing.
+    Known coordinates have no variance; the prior of the others is conditioned on them. Positions (n, d), covariance
+    (n d, n d); ``known_m``: known coordinates, nan elsewhere, shape (n, d). ``batch``: selects whether offset and scale
+    are estimated. Raises MappingError: shapes do not fit, or a position is missing.
     """
 
     def __init__(
@@ -78,7 +77,7 @@ class MoteMapper:
 
     @property
     def scale(self) -> float:
-        """Common scale of the ranges, less one."""
+        """Common scale of the ranges, minus one."""
         return float(self._filter.mean[-1])
 
     @property
@@ -87,7 +86,7 @@ class MoteMapper:
         return float(np.sqrt(np.trace(self._filter.covariance[: self._size, : self._size]) / self._count))
 
     def observe(self, first: int, second: int, range_m: float, sigma_m: float) -> Update:
-        """Condition the map on one distance. Raises MappingError: the motes stand in one place."""
+        """Update the map with one distance. Raises MappingError: both motes are at the same point."""
         rows = _Rows(self._dimension, self._count, [(first, second)], np.array([range_m]))
         R = np.array([sigma_m**2])
         learned = self._filter.update_iterated(rows.columns, rows, R, self._how.linearisations, self._gate)
@@ -108,7 +107,8 @@ class MoteMapper:
             starts = iter([self._filter.mean.copy()])
 
             def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-                # First at a better place than the prior; what lies between is taken along the same lines of sight.
+                # The first linearisation is at the last estimate, which is better than the prior. Its residual is
+                # extrapolated to the prior x.
                 at = next(starts, x)  # noqa: B023
                 residual, H = rows(at)
                 return residual + H @ (at - x)[rows.columns], H
@@ -149,10 +149,10 @@ class _Rows:
         return self._ranges_m - scale * distances - offset_m, H
 
     def curvature(self, x: FloatArray, P: FloatArray) -> FloatArray:
-        """Covariance of what the rows leave out of second order, tr(A_k P_kl A_l P_lk) / 2, shape (m, m).
+        """Covariance of the neglected second-order terms, tr(A_k P_kl A_l P_lk) / 2, shape (m, m).
 
-        P_kl is the covariance of the ways of two pairs; A, the second derivative of a distance, is (1 - u u^T) / r
-        across the line of sight u (Jazwinski 1970, section 9.3). Measuring a pair more often does not lessen it.
+        P_kl is the covariance of the vectors between the motes of pairs k and l. A = (1 - u u^T) / r is the second
+        derivative of a distance, u the line of sight (Jazwinski 1970, section 9.3). Repeated readings do not reduce it.
         """
         d, count = self._dimension, self._at.size // self._dimension
         ways, distances = self._ways(x)
@@ -171,10 +171,10 @@ class _Rows:
 
 
 def begin_phase_two(cfg: CricketConfig, plan: MotePlan, first: FirstMap) -> MoteMapper:
-    """The filter over the first motes of the stands, or over all motes where there are none, after phase 1.
+    """The filter after phase 1, for the first mote of each stand, or for all motes if there are no stands.
 
-    The printed prior, the covariance of Patil et al. eq. 25, is one variance for all coordinates. It is no prior of a
-    map by trilateration: its errors are centimetres to decimetres and correlated.
+    The printed prior, the covariance of Patil et al. eq. 25, is one variance for all coordinates. It does not describe
+    a map by trilateration, whose errors are correlated and centimetres to decimetres large.
     """
     motes = list(plan.heads or plan.mapped)
     at = coordinates_of(motes, plan.dimension)
@@ -187,10 +187,10 @@ def begin_phase_two(cfg: CricketConfig, plan: MotePlan, first: FirstMap) -> Mote
 
 
 class PhaseTwo(NamedTuple):
-    """How phase 2 went."""
+    """The course of phase 2."""
 
-    positions_m: FloatArray  # after each update, the first before any, shape (k + 1, n, d)
-    expected_rms_m: FloatArray  # likewise, shape (k + 1,)
+    positions_m: FloatArray  # before the first and after each update, shape (k + 1, n, d)
+    expected_rms_m: FloatArray  # at the same times, shape (k + 1,)
     nis: FloatArray  # of each update, shape (k,)
     refused: int
 
@@ -198,7 +198,7 @@ class PhaseTwo(NamedTuple):
 def run_phase_two(
     mapper: MoteMapper, readings: Iterable[tuple[int, int, float, float]], target_rms_m: float
 ) -> PhaseTwo:
-    """Observe one distance after the other until the expected error is small enough, or there are no more.
+    """Process distances one by one until the expected error is small enough, or none are left.
 
     ``readings``: first, second, range_m, sigma_m. ``target_rms_m``: of ``MoteMapper.expected_rms_m``.
     """
@@ -216,10 +216,9 @@ def run_phase_two(
 
 
 def conditioned(mean: FloatArray, covariance: FloatArray, known: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A Gaussian, given some of its coordinates exactly: m + P_k P_kk^+ (z - m_k), P - P_k P_kk^+ P_k^T.
+    """A Gaussian conditioned on exact values of some coordinates: m + P_k P_kk^+ (z - m_k), P - P_k P_kk^+ P_k^T.
 
-    ``mean``: shape (n,). ``covariance``: shape (n, n). ``known``: values, nan where a coordinate is not known, shape
-    (n,).
+    ``mean``: shape (n,). ``covariance``: shape (n, n). ``known``: the values, nan if not known, shape (n,).
     """
     at = np.flatnonzero(np.isfinite(known))
     if at.size == 0:
@@ -243,11 +242,11 @@ class CompletedMap(NamedTuple):
 
 
 def complete_stands(plan: MotePlan, first: FirstMap, mapper: MoteMapper) -> CompletedMap:
-    """Patil et al., figure 8, last box: motes 2 and 3 of each stand with respect to mote 1; in the plane.
+    """Patil et al., figure 8, last box: motes 2 and 3 of each stand relative to mote 1, in the plane.
 
-    Where a stand looks is what phase 1 found of its three motes, by the best turn of the known shape; its error is that
-    of the turn, dtheta = sum(w_k x dp_k) / sum(|w_k|^2) over the arms w_k about their mean, and is taken as independent
-    of the heads, which phase 2 has placed far better than phase 1 had.
+    The orientation of a stand is the rotation that fits its known shape best to the positions of phase 1. Its error is
+    dtheta = sum(w_k x dp_k) / sum(|w_k|^2) over the arms w_k about their mean. It is taken as independent of the heads,
+    because phase 2 has placed them far better than phase 1 had.
     """
     motes = [mote for body in plan.bodies for mote in body.motes]
     at_heads = coordinates_of(np.repeat(np.arange(len(plan.bodies)), [len(body.motes) for body in plan.bodies]), 2)

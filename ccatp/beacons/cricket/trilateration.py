@@ -1,4 +1,4 @@
-"""Phase 1 of self-mapping: a first map by trilateration after a plan, and its drawn errors."""
+"""Phase 1 of self-mapping: a first map by trilateration in a planned order, and its errors by simulation."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -12,23 +12,23 @@ from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNe
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import RigidMotion
 
-_APART = 10.0  # sigmas between two solutions that are not the same one
-_ALIKE = 9.0  # difference of chi-squared up to which a mirror image may as well be the truth
-_NEAR = 20  # maps close by at which errors are drawn
-_DRAWN_STEPS = 15  # of each drawn trilateration; references that are decimetres off make it go slowly
+_APART = 10.0  # distance in sigmas above which two solutions are different
+_ALIKE = 9.0  # difference of chi-squared below which the mirror image may be the true position
+_NEAR = 20  # nearby maps at which errors are drawn
+_DRAWN_STEPS = 15  # per drawn trilateration; it converges slowly because references are off by decimetres
 _STEPS = 100
 _REST_M = 1e-6
-_DAMPING = 1e-6  # of the trace of the normal matrix: references of a draw may come to lie in line
+_DAMPING = 1e-6  # of the trace of the normal matrix, because the references of a draw may be in line
 
 
 def trilaterate(
     starts_m: FloatArray, anchors_m: FloatArray, ranges_m: FloatArray, sigmas_m: FloatArray,
     robust_scale: float = float("inf"), steps: int = _STEPS,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Places from ranges to anchors, and their costs: damped Gauss-Newton steps of many problems at once.
+    """Positions from ranges to anchors, and their costs: damped Gauss-Newton on b problems at once.
 
-    Starts (b, d); anchors (b, k, d) and ranges (b, k), or (k, d) and (k,) where they are the same for all; sigmas (k,).
-    ``robust_scale``: as of ``MapFitSettings``.
+    Starts (b, d); anchors (b, k, d) and ranges (b, k), or (k, d) and (k,) if common to all problems; sigmas (k,).
+    ``robust_scale``: see ``MapFitSettings``.
     """
     d = starts_m.shape[1]
 
@@ -57,9 +57,9 @@ def trilaterate(
 
 
 def sphere_crossings(anchors_m: FloatArray, ranges_m: FloatArray) -> FloatArray:
-    """Both crossings of the spheres about anchors, on either side of the plane through them, shape (2, ..., d).
+    """Both intersections of the spheres about anchors, one on each side of the plane through them, shape (2, ..., d).
 
-    Of more than d anchors, the places that meet the ranges best on the average. ``anchors_m``: shape (..., k, d);
+    For more than d anchors, the points that fit the ranges best on average. ``anchors_m``: shape (..., k, d);
     ``ranges_m``: shape (..., k).
     """
     centre = anchors_m.mean(axis=-2, keepdims=True)
@@ -79,25 +79,25 @@ class DegenerateStep(MappingError):
 
 
 class FirstMap(NamedTuple):
-    """What phase 1 gives."""
+    """The result of phase 1."""
 
     positions_m: FloatArray  # shape (n, d)
     covariance_m2: FloatArray  # of all coordinates, zero without draws, shape (n d, n d)
-    bias_m: FloatArray  # mean error of the places, as far as it is known, shape (n, d)
+    bias_m: FloatArray  # estimated mean error of the positions, zero without draws, shape (n, d)
     doubtful: tuple[int, ...] = ()  # motes whose mirror image fits almost as well
 
 
 def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: int = 0, maps: int = _NEAR) -> FirstMap:
-    """Phase 1 of Patil et al., figure 8, in the field's frame.
+    """Phase 1 of Patil et al., figure 8, in the frame of the field.
 
-    A is the origin, B on the second axis, the first stand follows by the law of cosines, on the right of the axis from
-    A to B, every other one by trilateration from all motes of the stand before it. ``draws``, ``maps``: as of
+    A is the origin and B lies on the second axis. The first stand follows by the law of cosines, to the right of the
+    axis from A to B; each other one by trilateration from all motes of the stand before it. ``draws``, ``maps``: see
     ``_drawn_errors``. Raises MappingError: a range that a step needs is missing. Raises DegenerateStep: a mote is on
-    the axis, those that it is placed from lie on a line with it, or nearly, or its mirror image fits as well.
+    the axis, or nearly in line with its references, or its mirror image fits as well.
     """
     means = PairMeans(network)
     found_m = _laid_out(plan, means, max_dop)
-    shaped_m = found_m.copy()  # with the stands as they are known to be
+    shaped_m = found_m.copy()  # with the known shapes of the stands
     for stand in plan.bodies:
         shaped_m[list(stand.motes)] = stand.placed(found_m)
     bias_m, covariance_m2 = _drawn_errors(plan, means, shaped_m, draws, maps)
@@ -107,7 +107,7 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
 
 
 def _steps(plan: MotePlan) -> Iterator[tuple[int, list[int], RigidBody | None]]:
-    """Each mote but A and B, with those that it is placed from: these two, or the stand before its own."""
+    """Each mote but A and B, with its references: A and B, or the motes of the stand before its own."""
     yield from ((mote, list(plan.anchors), None) for mote in plan.bodies[0].motes)
     for before, after in pairwise(plan.bodies):
         yield from ((mote, list(before.motes), before) for mote in after.motes)
@@ -136,8 +136,8 @@ def _laid_out(plan: MotePlan, means: PairMeans, max_dop: float) -> FloatArray:
                     "well; spread the motes it is measured from"
                 )
             places_m[mote] = found_m[np.argmin(costs)]
-        # The error of a place from a small stand is far larger than that of a range: from a stand whose motes came out
-        # wider apart than they are, the next ones would look better determined than they are.
+        # Positions from a small stand have far larger errors than ranges. If a stand came out too wide, the next motes
+        # would seem better determined than they are. So use its known shape.
         dop = _dilution(places_m[mote] - (anchors_m if stand is None else stand.placed(places_m)))
         if not dop <= max_dop:
             raise DegenerateStep(
@@ -168,19 +168,18 @@ def _drawn_errors(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (n, d) and covariance (n d, n d) of the errors, by the parametric bootstrap (Efron 1979).
 
-    At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps
-    made of them. Derivatives would not do: from a small stand errors grow to decimetres, and along so wide an arc
-    no line is a tangent everywhere. What a line takes to be known within a millimetre is known within centimetres.
-    For the same reason the errors at those places are not those at the true ones: they are drawn again at a few of
-    the ``maps`` that were drawn (iterated bootstrap: Hall 1986; 0: at the places alone). These are turned one way
-    and the other, so across the arcs the covariance is wider than that of the errors there are (NEES 0.8); phase 2
-    is less sure than the errors at the places alone would make it (docs/cricket.md). ``places_m``: where the motes
-    might be, shape (n, d). Zeros without draws.
+    Ranges with the expected errors are drawn at positions near the estimate, and the same steps are made from them.
+    First derivatives are not enough: from a small stand errors grow to decimetres along an arc, and a linear
+    approximation claims millimetres across it where the true error is centimetres. For the same reason the errors at
+    the estimate differ from those at the true positions, so they are drawn again at ``maps`` drawn maps (iterated
+    bootstrap: Hall 1986; 0: at the estimate alone). These maps are turned to both sides, so the covariance across the
+    arcs is too large (NEES 0.8), and phase 2 is more cautious than with errors at the estimate alone
+    (docs/cricket.md). ``places_m``: the estimate, shape (n, d). Zeros without draws.
     """
     count, d = places_m.shape
     if draws == 0:
         return np.zeros_like(places_m), np.zeros((count * d, count * d))
-    rng = np.random.default_rng(0)  # the same draws for every map: the same ranges give the same one
+    rng = np.random.default_rng(0)  # fixed seed: the same ranges give the same result
     near = _drawn(plan, means, places_m, maps, rng) if maps else places_m[None]
     errors = np.concatenate([_drawn(plan, means, at_m, draws // len(near), rng) - at_m for at_m in near])
     errors = errors.reshape(len(errors), -1)
@@ -188,7 +187,7 @@ def _drawn_errors(
 
 
 def _drawn(plan: MotePlan, means: PairMeans, places_m: FloatArray, draws: int, rng: np.random.Generator) -> FloatArray:
-    """Maps by the same steps from ranges with errors between some places (n, d), shape (draws, n, d)."""
+    """Maps by the same steps from noisy ranges between positions (n, d), shape (draws, n, d)."""
     count, d = places_m.shape
     first, second = means.pairs.T
     true_m = np.linalg.norm(places_m[first] - places_m[second], axis=1)
@@ -209,6 +208,6 @@ def _drawn(plan: MotePlan, means: PairMeans, places_m: FloatArray, draws: int, r
 
 
 def _by_cosines(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    # y = (d_A^2 + d_AB^2 - d_B^2) / (2 d_AB), x = sqrt(d_A^2 - y^2); x is nought where the circles do not meet.
+    # y = (d_A^2 + d_AB^2 - d_B^2) / (2 d_AB), x = sqrt(d_A^2 - y^2); x is zero if the circles do not intersect.
     y = (a * a + c * c - b * b) / (2.0 * c)
     return np.stack([np.sqrt(np.maximum(a * a - y * y, 0.0)), y], axis=-1)
