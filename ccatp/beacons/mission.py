@@ -1,4 +1,4 @@
-"""A mission among beacons: from readings and the verdict of the danger loop to set points. Time is an argument."""
+"""A mission among beacons: set points from readings and the verdict of the danger loop. Time is an argument."""
 
 from math import isfinite
 from typing import NamedTuple
@@ -28,12 +28,12 @@ from ccatp.survey.events import (
 from ccatp.survey.failsafe import ON_EARTHQUAKE, ON_EMERGENCY, ON_FAULT, ON_HOLD, ON_NO_VERDICT, is_denied, pause
 from ccatp.survey.state import Hold, HoldRules, HoldState, Row
 
-# What such a mission is at; idle, held and done mean to the danger loop that the robot stands.
+# States of such a mission. In idle, held and done the danger loop expects the robot to stand.
 MODES = IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE
 
 
 class BeaconRules(HoldRules[HoldState]):
-    """A mission among beacons goes about its business as soon as any motion is permitted."""
+    """A mission among beacons proceeds as soon as any motion is permitted."""
 
     rows = (
         *(ON_EARTHQUAKE, ON_FAULT, ON_HOLD, ON_NO_VERDICT),
@@ -42,7 +42,7 @@ class BeaconRules(HoldRules[HoldState]):
     )
 
     def proceed(self, s: HoldState) -> HoldState:
-        """The next frame says where to."""
+        """Back to idle; the next frame selects the mode."""
         return replace(s, mode=IDLE, cause=s.abort_cause, hold=Hold())
 
 
@@ -50,10 +50,10 @@ RULES = BeaconRules()
 
 
 def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -> SteeringCommand:
-    """What is left of a drive.
+    """The permitted part of a command.
 
-    Where forward motion is wanted and denied, the robot backs off straight, if that is permitted: what it stands before
-    stays there, and wheels that steer cannot turn on the spot.
+    If forward motion is wanted but denied, the robot moves straight back, if that is permitted: the obstacle ahead does
+    not go away, and a vehicle with steered wheels cannot turn on the spot.
     """
     if not all(map(isfinite, drive)):
         return HALT
@@ -67,18 +67,18 @@ def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -
 
 
 class WaypointArrival(NamedTuple):
-    """A waypoint is reached."""
+    """A reached waypoint."""
 
-    waypoint: int  # its number in the loop, from 0
+    waypoint: int  # its number in the list, from 0
     lap: int  # from 0
     place_m: tuple[float, float]
     belief: PoseBelief
 
 
 class BeaconMission:
-    """Maps and visits waypoints, or follows a radio, and returns to its start when it is given up.
+    """Maps and visits waypoints, or follows a radio; returns to its start when it is aborted.
 
-    Call ``step`` once per frame. The robot stands at its believed start.
+    Call ``step`` once per frame. The robot must begin at the configured start.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
@@ -93,7 +93,7 @@ class BeaconMission:
         self.state = HoldState()
 
     def handle(self, event: SurveyInput) -> str | None:
-        """An event between two frames; why it was refused, or ``None``."""
+        """Handle an event between two frames. Returns the reason of a refusal, or ``None``."""
         self.state, refusal = RULES.handle(self.state, event)
         return refusal
 
@@ -108,25 +108,25 @@ class BeaconMission:
 
     @property
     def total(self) -> int:
-        """Waypoints to be reached, or seconds to follow."""
+        """Number of waypoints to reach, or seconds to follow."""
         mission = self._cfg.mission
         return round(mission.follow_s) if self._is_following else mission.laps * len(self._cfg.workspace.waypoints_m)
 
     @property
     def done(self) -> int:
-        """Of these."""
+        """Waypoints reached, or seconds followed."""
         return min(int(self._followed_s), self.total) if self._is_following else len(self.arrivals)
 
     @property
     def next_waypoint(self) -> int:
-        """Number of the waypoint driven to, -1 for none."""
+        """Number of the current waypoint, -1 for none."""
         is_visiting = not self._is_following and len(self.arrivals) < self.total
         return len(self.arrivals) % len(self._cfg.workspace.waypoints_m) if is_visiting else -1
 
     def step(self, measurements: BeaconMeasurements, interval_s: float, verdict: Verdict | None) -> SteeringCommand:
-        """One frame: take its readings, react to the verdict, drive on as far as it permits.
+        """One frame: process its readings, react to the verdict, and return a command that it permits.
 
-        ``verdict``: the danger loop's, in force; ``None`` where there is none fresh enough.
+        ``verdict``: the current one of the danger loop; ``None`` if there is no recent one.
         """
         self.navigator.take(measurements)
         t_s = measurements.t_s
@@ -150,7 +150,7 @@ class BeaconMission:
                 self._enter(MAPPING)
             return HALT
         t_s, avoidance = measurements.t_s, self._cfg.avoidance
-        # Sensors without a reading in this frame count as seeing nothing: what they saw before is remembered.
+        # A frame without readings counts as free space; the pilot remembers earlier obstacles.
         distances_m = measurements.extras.distances or [avoidance.range_max_m] * len(avoidance.sensors_rad)
         if self.state.abort_cause:
             return self._return(t_s, interval_s, distances_m)
@@ -186,9 +186,9 @@ class BeaconMission:
 
 
 def wheel_rates(drive: SteeringCommand, cfg: RadioConfig) -> tuple[float, float, float | None]:
-    """Rates of the right and the left wheel, rad/s, and the angle of the steered wheel, rad, ``None`` without one.
+    """Rates of the right and the left wheel, rad/s, and the steering angle, rad, ``None`` for a differential drive.
 
-    Their mean is v / r, their difference omega b / r with the track b; steered wheels turn alike.
+    The mean rate is v / r, the difference omega b / r with the track b; on an Ackermann vehicle both rates are equal.
     """
     radius_m, vehicle = cfg.robot.wheel_radius_m, cfg.vehicle
     rate_rad_s = drive.speed_m_s / radius_m
@@ -198,7 +198,8 @@ def wheel_rates(drive: SteeringCommand, cfg: RadioConfig) -> tuple[float, float,
     return rate_rad_s + half_rad_s, rate_rad_s - half_rad_s, None
 
 
-# The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
+# Relative difference (rad for angles of sensors) above which the configuration is of another robot. It is not zero,
+# because the configuration may be calibrated, while the robot reports nominal values.
 TOLERANCE = 0.05
 TrackRow = tuple[int, float, float, float, float, float, float, float, float, float, float, float, float]
 

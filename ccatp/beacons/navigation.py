@@ -1,4 +1,4 @@
-"""Where a robot among beacons is: radios mapped on the way, or ultrasonic motes that map themselves first."""
+"""Localization of a robot: by radios, mapped while it drives, or by ultrasonic motes, which map themselves first."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from math import hypot
@@ -23,11 +23,10 @@ from ccatp.links.robot_messages import Sensors
 
 
 class SelfMap:
-    """Collects the pulses between motes until their map is good enough.
+    """Collects ranges between motes until their map is good enough.
 
-    Phase 1 begins when every pair of its plan has been read as often as configured, phase 2 takes the readings after
-    that one by one (Patil et al., figure 8). ``notes``: errors that are expected after each phase, m; updates of phase
-    2.
+    Phase 1 runs when every pair of its plan has the configured number of readings. Phase 2 then processes each later
+    reading (Patil et al., figure 8). ``notes``: expected error after each phase, m; number of updates of phase 2.
     """
 
     def __init__(self, cfg: CricketConfig) -> None:
@@ -45,7 +44,7 @@ class SelfMap:
 
     @property
     def is_done(self) -> bool:
-        """Good enough, or as good as it gets with the readings there may be."""
+        """Whether the expected error is small enough, or the largest number of updates is reached."""
         phase2, mapper = self._cfg.phase2, self._mapper
         if mapper is None:
             return False
@@ -57,10 +56,9 @@ class SelfMap:
         return None if self._mapper is None else (self._mapper.positions_m, self._mapper.covariance_m2)
 
     def take(self, burst: MoteBurst) -> None:
-        """A pulse from one mote to another; those of others are none of ours.
+        """Process readings between two motes of the plan; others are ignored.
 
-        Raises MappingError: phase 1 cannot be made of these ranges. Raises TdoaError: a delay or a temperature that
-        none can be.
+        Raises MappingError: phase 1 fails with these ranges. Raises TdoaError: an impossible delay or temperature.
         """
         first, second = self._index.get(burst.sender), self._index.get(burst.listener)
         if first is None or second is None or self.is_done:
@@ -99,19 +97,19 @@ class SelfMap:
         self.notes["map_expected_m"] = mapper.expected_rms_m
 
 
-_EPSILON_S = 1e-9  # an interval shorter than this is none
+_EPSILON_S = 1e-9  # a shorter interval counts as zero
 
 
 class BeaconMeasurements(NamedTuple):
-    """A frame as a mission takes it."""
+    """The measurements of one frame."""
 
     t_s: float
-    wheels: tuple[Odometry, ...]  # odometry since the last frame, without gaps; empty where nothing is known of it
+    wheels: tuple[Odometry, ...]  # odometry since the last frame, without gaps; empty if unknown
     extras: BeaconFrame
 
 
 def packets_of(scan: RadioScan) -> Iterator[tuple[str, float, float]]:
-    """Answers of radios: name, direction of the reflector left of the heading (rad), level (dBm)."""
+    """Replies of radios: name, direction of the reflector left of the heading (rad), level (dBm)."""
     for beacon, levels in scan.levels.items():
         yield from ((beacon, k * scan.step, level) for k, level in enumerate(levels) if level is not None)
 
@@ -119,14 +117,14 @@ def packets_of(scan: RadioScan) -> Iterator[tuple[str, float, float]]:
 def odometry_of(
     cfg: RadioConfig, end_s: float, interval_s: float, speed_m_s: float, steer_rad: float, turn_rate_rad_s: float
 ) -> Odometry:
-    """Odometry of an interval, as the motion model of the vehicle takes it; angle and rate to the left."""
+    """Odometry of an interval for the motion model of the vehicle; angle and rate are positive to the left."""
     if cfg.vehicle.kind == "ackermann":
         return Steering(end_s, interval_s, speed_m_s, steer_rad)
     return Increment(end_s, interval_s, speed_m_s * interval_s, turn_rate_rad_s * interval_s)
 
 
 class MeasurementReader:
-    """Reads one frame after the other."""
+    """Converts successive frames to measurements."""
 
     def __init__(self, cfg: RadioConfig) -> None:
         self._cfg = cfg
@@ -134,11 +132,11 @@ class MeasurementReader:
         self._steer_rad = 0.0
 
     def forget(self) -> None:
-        """The robot's clock starts again."""
+        """Reset, because the clock of the robot was restarted."""
         self._read_to_s = None
 
     def read(self, sensors: Sensors, extras: BeaconFrame) -> BeaconMeasurements:
-        """The readings of a frame; each wheel sample stands for the time since the one before."""
+        """The readings of a frame; each wheel sample covers the time since the previous one."""
         if self._read_to_s is None:
             self._read_to_s = sensors.t
         steering = {sample.t_s: sample.steer_rad for sample in extras.steer}
@@ -151,7 +149,7 @@ class MeasurementReader:
         before_s = sample.t_s if self._read_to_s is None else self._read_to_s
         interval_s = sample.t_s - before_s
         if right is None or left is None or interval_s < _EPSILON_S:
-            return None  # the next sample stands for this time, too
+            return None  # the next sample also covers this time
         self._read_to_s = sample.t_s
         radius_m = self._cfg.robot.wheel_radius_m
         speed_m_s = 0.5 * radius_m * (right + left)
@@ -160,14 +158,14 @@ class MeasurementReader:
 
 
 class PoseBelief(NamedTuple):
-    """What is believed now."""
+    """The estimated pose."""
 
     pose: tuple[float, float, float]  # x m, y m, heading rad (continuous)
-    covariance: FloatArray  # of these, shape (3, 3)
+    covariance: FloatArray  # of the pose, shape (3, 3)
 
     @property
     def ellipse(self) -> Ellipse:
-        """x, y and their covariance xx, xy, yy."""
+        """Position x, y (m) and its covariance xx, xy, yy (m^2)."""
         return ellipse_of(self.pose, self.covariance)
 
     @property
@@ -177,7 +175,7 @@ class PoseBelief(NamedTuple):
 
 
 class Score(NamedTuple):
-    """How the readings agree with what was expected of them, all so far."""
+    """Consistency of all readings so far with their predictions."""
 
     nis_sum: float
     nis_size: int
@@ -185,12 +183,12 @@ class Score(NamedTuple):
 
 
 def ellipse_of(mean: FloatArray | Sequence[float], covariance: FloatArray) -> Ellipse:
-    """x, y and their covariance of a place, shapes (2+,) and (2+, 2+)."""
+    """Position and covariance as xx, xy, yy; shapes (2+,) and (2+, 2+)."""
     return (float(mean[0]), float(mean[1]), float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]))
 
 
 class _DeadReckoning:
-    """Where the robot would be by odometry alone, and how the readings agree with what was expected of them."""
+    """The position by odometry alone, and the consistency of the readings."""
 
     def __init__(self, cfg: RadioConfig) -> None:
         self._cfg, self._motion = cfg, SlippingVehicle(cfg.vehicle, cfg.odometry)
@@ -206,12 +204,12 @@ class _DeadReckoning:
 
     @property
     def reckoned_m(self) -> tuple[float, float]:
-        """Where dead reckoning alone would see it."""
+        """Position by odometry alone."""
         return float(self._reckoned[0]), float(self._reckoned[1])
 
 
 class RadioNavigator(_DeadReckoning):
-    """EKF-SLAM on levels and bearings of radios that are mapped on the way."""
+    """EKF-SLAM with levels and bearings of radios, which are mapped while the robot drives."""
 
     is_mapping = False  # the map grows while the robot drives
 
@@ -228,7 +226,7 @@ class RadioNavigator(_DeadReckoning):
 
     @property
     def beacons(self) -> Mapping[str, Ellipse]:
-        """The map, the target among the radios."""
+        """The map of the radios, including the target."""
         return {str(name): ellipse_of(found.mean, found.covariance) for name, found in self.slam.beacons.items()}
 
     @property
@@ -237,7 +235,7 @@ class RadioNavigator(_DeadReckoning):
         return {name: mean for name, (mean, _) in self.slam.calibration.items()}
 
     def target(self, t_s: float) -> TargetSight | None:
-        """The radio that is followed, at a time; ``None`` before its first reading."""
+        """The followed radio at time ``t_s``; ``None`` before its first reading."""
         estimate = self.slam.beacons.get(self._target)
         if estimate is None or self._received_s is None:
             return None
@@ -246,7 +244,7 @@ class RadioNavigator(_DeadReckoning):
         return TargetSight((x_m, y_m), sigma_m, t_s - self._received_s, self.slam.moving_velocity_m_s)
 
     def take(self, measurements: BeaconMeasurements) -> None:
-        """Predict over the wheels' intervals, then take the readings of the frame."""
+        """Predict over the odometry intervals, then update with the readings of the frame."""
         for odometry in measurements.wheels:
             self.slam.predict(odometry)
             self._reckoned = self._motion.step(self._reckoned, odometry).mean
@@ -262,15 +260,15 @@ class RadioNavigator(_DeadReckoning):
 
 
 _PLACE = 2
-_NEAREST_M = 0.02  # nearer than that a range has no direction
+_NEAREST_M = 0.02  # lower limit of a distance, below which a range has no direction
 
 
 class MoteNavigator(_DeadReckoning):
     """An EKF over the robot and all motes of the map.
 
-    State: pose and its calibration, then the motes. The map joins with the joint covariance that its self-mapping left,
-    so that its correlated errors count as such: ranges correct the robot as far as the map is known, and
-    the map as far as the robot is. A range is z = |p - m| + noise.
+    State: pose and calibration of the vehicle, then the motes. The map is added with the joint covariance of its
+    self-mapping, so that correlated errors are treated as such: a range corrects both the robot and the map, according
+    to their covariances. A range is z = |p - m| + noise.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
@@ -286,7 +284,7 @@ class MoteNavigator(_DeadReckoning):
 
     @property
     def is_mapping(self) -> bool:
-        """The robot has to stand: the motes have no map of themselves yet."""
+        """Whether the motes have no map yet; the robot must not move until then."""
         return not self._place_of
 
     @property
@@ -297,7 +295,7 @@ class MoteNavigator(_DeadReckoning):
 
     @property
     def beacons(self) -> Mapping[str, Ellipse]:
-        """The map; before the robot has one, that of the motes."""
+        """The map of the robot; before that, the current map of the self-mapping."""
         if self._place_of:
             mean, P, at = self._filter.mean, self._filter.covariance, self._place_of
         else:
@@ -310,17 +308,17 @@ class MoteNavigator(_DeadReckoning):
 
     @property
     def notes(self) -> Mapping[str, float]:
-        """How well the map is known."""
+        """Expected errors of the map, its updates and its time."""
         return self._self_map.notes
 
     def target(self, _t_s: float) -> TargetSight | None:
-        """Nothing is followed."""
+        """None: there is no target to follow."""
         return None
 
     def take(self, measurements: BeaconMeasurements) -> None:
-        """Predict over the wheels' intervals, then take the readings of the frame.
+        """Predict over the odometry intervals, then update with the readings of the frame.
 
-        Raises MappingError: the motes cannot be mapped. Raises TdoaError: a delay or a temperature that none can be.
+        Raises MappingError: the motes cannot be mapped. Raises TdoaError: an impossible delay or temperature.
         """
         state = self._filter
         for odometry in measurements.wheels:
@@ -334,7 +332,7 @@ class MoteNavigator(_DeadReckoning):
                 self._self_map.take(burst)
         if self.is_mapping and self._self_map.is_done and self._self_map.places is not None:
             positions_m, covariance_m2 = self._self_map.places
-            none, size = np.empty(0, dtype=np.intp), positions_m.size  # nothing ties the map to the robot yet
+            none, size = np.empty(0, dtype=np.intp), positions_m.size  # no correlation with the robot yet
             state.augment("map", positions_m.ravel(), none, np.zeros((size, 0)), np.eye(size), covariance_m2)
             start = state.block("map").start
             self._place_of = {name: start + _PLACE * row for row, name in enumerate(self._self_map.names)}

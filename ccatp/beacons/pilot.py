@@ -1,4 +1,4 @@
-"""Where a robot among beacons drives next: to waypoints or behind the target, round obstacles, away from a threat."""
+"""Local motion planning of a robot among beacons: visit waypoints, follow a target, avoid obstacles, back off."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -19,20 +19,20 @@ from ccatp.beacons.steering import (
 from ccatp.config.beacon_models import AvoidanceConfig, FollowConfig, RadioConfig
 from ccatp.core import bearing, wrap_pi
 
-_NEAREST_M = 0.02  # nearer than that a direction means nothing
+_NEAREST_M = 0.02  # lower limit of a distance, below which the direction is meaningless
 
 
 class FollowState(StrEnum):
-    """What a follower is doing."""
+    """State of a follower."""
 
-    LOST = "lost"  # not received for too long, or never: stands
+    LOST = "lost"  # target not received for too long, or never: stops
     APPROACHING = "approaching"
-    HOLDING = "holding"  # within the band round the safe distance: stands
-    BACKING = "backing"  # too near
+    HOLDING = "holding"  # within the band round the safe distance: stops
+    BACKING = "backing"  # too near: moves back
 
 
 class TargetSight(NamedTuple):
-    """What is believed of the target."""
+    """The estimate of the target."""
 
     position_m: Point
     sigma_m: float
@@ -41,12 +41,12 @@ class TargetSight(NamedTuple):
 
 
 class Follower:
-    """Keeps a safe distance from a point that moves.
+    """Keeps a safe distance from a moving point.
 
-    The distance to keep grows by the uncertainty of the target along the line of sight, so a robot that knows little
-    stays away, and by what the target will have come nearer in a moment. It is a limit from below: a target that is
-    nearer is backed off from until it is a band farther; one that is farther than two bands beyond is approached until
-    it is one band beyond; in between the robot stands. So noise does not switch its state.
+    The minimum distance grows with the uncertainty of the target along the line of sight, and with the distance by
+    which the target will come nearer within ``foresight_s``. If the target is nearer than the minimum, the robot moves
+    back until it is one band beyond the minimum. If it is farther than two bands beyond, the robot approaches to one
+    band beyond. In between it stops, so that noise does not switch the state.
     """
 
     def __init__(self, cfg: FollowConfig, driver: WaypointSteering) -> None:
@@ -56,7 +56,7 @@ class Follower:
         self._sight: BearingToPoint | None = None
 
     def aim(self, pose: PlanarPose, target: TargetSight | None) -> BearingToPoint | None:
-        """What is left to go, and decides what to do; None while nothing is to be approached."""
+        """Update the state; return the remaining distance and heading error, None if there is nothing to approach."""
         self._sight = None
         if target is None or target.age_s > self._cfg.lost_after_s:
             self.state = FollowState.LOST
@@ -64,9 +64,9 @@ class Follower:
         self._sight = aim_at(pose, target.position_m)
         cfg = self._cfg
         dx_m, dy_m = pose[0] - target.position_m[0], pose[1] - target.position_m[1]
-        vx, vy = target.velocity_m_s  # only what comes nearer counts
+        vx, vy = target.velocity_m_s  # only its part towards the robot counts
         closing_m = cfg.foresight_s * max(0.0, (vx * dx_m + vy * dy_m) / max(hypot(dx_m, dy_m), _NEAREST_M))
-        # at most as much again: who stays away from what he does not know learns nothing of it
+        # At most the safe distance again: a robot that stays too far away never improves its estimate of the target.
         margin_m = min(cfg.margin_sigmas * target.sigma_m, cfg.safe_distance_m)
         left_m = self._sight.distance_m - cfg.safe_distance_m - margin_m - closing_m
         self.state = self._next_state(left_m)
@@ -75,7 +75,7 @@ class Follower:
         return BearingToPoint(max(left_m - cfg.band_m, 0.0), self._sight.error_rad)
 
     def stay(self) -> SteeringCommand:
-        """Set points while nothing is to be approached: back off, turn to the target, or stand."""
+        """Set points when there is nothing to approach: back off, turn to the target, or stop."""
         self._driver.reset()
         if self._sight is None:
             return HALT
@@ -92,7 +92,7 @@ class Follower:
         return FollowState.HOLDING
 
 
-_AHEAD_RAD = pi / 3.0  # what lies within this of the course is in the way of the body
+_AHEAD_RAD = pi / 3.0  # obstacles within this angle of the course are in the way of the body
 
 
 class _Obstacle(NamedTuple):
@@ -102,11 +102,11 @@ class _Obstacle(NamedTuple):
 
 
 class ObstacleAvoider:
-    """Chooses the free heading nearest to the aim, after Borenstein and Koren's vector field histogram (1991).
+    """Chooses the free heading nearest to the goal, after the vector field histogram of Borenstein and Koren (1991).
 
-    Echoes are kept as points in the room for a while, because a few sensors look past what stands between them. A point
-    at distance d blocks the headings within asin((radius + margin) / d) of its own. Of the free ones that heading is
-    taken whose distance from the aim, and a tenth of that from straight ahead, is least: that keeps to one side.
+    Echoes are stored as points in the room for a while, because a few sensors miss obstacles between their beams. A
+    point at distance d blocks the headings within asin((radius + margin) / d) of its direction. The chosen free heading
+    minimises its angle to the goal plus a tenth of its angle to straight ahead, so that it does not change sides.
     """
 
     def __init__(self, cfg: AvoidanceConfig, radius_m: float) -> None:
@@ -115,7 +115,7 @@ class ObstacleAvoider:
         self._echoes: deque[_Obstacle] = deque()
 
     def see(self, time_s: float, pose: PlanarPose, distances_m: Sequence[float]) -> None:
-        """Remember what the sensors show, and forget what is old."""
+        """Store the obstacles that the sensors detect, and drop old ones."""
         while self._echoes and time_s - self._echoes[0].time_s > self._cfg.memory_s:
             self._echoes.popleft()
         for direction_rad, distance_m in zip(self._cfg.sensors_rad, distances_m, strict=True):
@@ -126,8 +126,8 @@ class ObstacleAvoider:
                 )
 
     def way(self, pose: PlanarPose, aim: BearingToPoint) -> tuple[BearingToPoint, float]:
-        """What is left of an aim at a pose, and of the speed: 1 far from everything, 0 where only standing is safe."""
-        # What stands behind the aim is not in the way to it.
+        """The goal with a free heading, and a factor of the speed: 1 far from obstacles, 0 if the robot must stop."""
+        # Obstacles behind the goal are not in the way to it.
         near = [echo for echo in self._near(pose) if echo[0] - self._reach_m < aim.distance_m]
         blocked = [(wrap_pi(angle_rad), asin(min(1.0, self._reach_m / max(d, 1e-6)))) for d, angle_rad in near]
         error_rad = self._free_heading(aim.error_rad, blocked)
@@ -136,15 +136,15 @@ class ObstacleAvoider:
         return BearingToPoint(aim.distance_m, error_rad), self._speed_factor(near)
 
     def clear_m(self, pose: PlanarPose, direction_rad: float) -> float:
-        """Distance to the nearest remembered obstacle in the way of a body that moves in a direction, m.
+        """Distance to the nearest stored obstacle in the direction of motion, m.
 
-        ``direction_rad``: of the motion, left of the heading: 0 forwards, pi backwards.
+        ``direction_rad``: left of the heading: 0 forwards, pi backwards.
         """
         in_way = (d for d, angle_rad in self._near(pose) if abs(wrap_pi(angle_rad - direction_rad)) < _AHEAD_RAD)
         return min(in_way, default=inf)
 
     def points_m(self) -> list[Point]:
-        """What is remembered, in the room."""
+        """Stored obstacles, in the frame of the room."""
         return [(echo.x_m, echo.y_m) for echo in self._echoes]
 
     def _near(self, pose: PlanarPose) -> Iterator[tuple[float, float]]:
@@ -170,21 +170,21 @@ class ObstacleAvoider:
         return max(0.0, min(1.0, (ahead_m - cfg.stop_m) / (cfg.influence_m - cfg.stop_m)))
 
 
-_STEPS = 6  # of an arc, where distances are looked at
-_CURVES = (0.0, -0.3, 0.3, -0.6, 0.6, -1.0, 1.0)  # shares of the largest steering
+_STEPS = 6  # points of an arc at which distances are checked
+_CURVES = (0.0, -0.3, 0.3, -0.6, 0.6, -1.0, 1.0)  # fractions of the largest steering angle
 _COURSES = 24  # of a vehicle that turns on the spot
-_TURN_S = 1.0  # it turns by what is left in that time ...
-_STRAIGHT_RAD = 0.3  # ... and goes when less is left
-_KEEPING = 0.03  # metres that an arc in the direction of the last one may gain less than another
+_TURN_S = 1.0  # it turns at the remaining angle over this time,
+_STRAIGHT_RAD = 0.3  # and drives if the remaining angle is smaller
+_KEEPING = 0.03  # bonus, m, for an arc in the same direction, forwards or backwards, as the last one
 
 
 class BackOff:
     """A dynamic window over arcs forwards and backwards (Fox, Burgard, Thrun 1997).
 
-    Of a vehicle that turns on the spot over courses, each after its turn. One is possible if the vehicle stays in the
-    room, and keeps ``avoidance.stop_m`` from everything that the sensors have seen or, where it is nearer already, does
-    not come nearer. Of these it takes the one after which the threat, going on as it goes, is farthest; where none
-    gains anything it stands.
+    A vehicle that turns on the spot uses straight courses instead, each after a turn. A candidate is valid if the
+    vehicle stays in the room and keeps ``avoidance.stop_m`` from all detected obstacles, or, if it is already nearer,
+    does not come nearer. It takes the valid candidate that ends farthest from the threat, which is assumed to keep its
+    velocity. If none increases the distance, it stops.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
@@ -260,19 +260,19 @@ class BackOff:
 
 
 class PilotState(StrEnum):
-    """What the pilot is doing."""
+    """State of the pilot."""
 
     VISITING = "visiting"  # on the way to a waypoint
-    ARRIVED = "arrived"  # all waypoints reached: stands
+    ARRIVED = "arrived"  # all waypoints reached: stops
     FOLLOWING = "following"  # see ``FollowState``
-    AVOIDING = "avoiding"  # off its course to get round something
-    ESCAPING = "escaping"  # backs off from what stands too near ahead
+    AVOIDING = "avoiding"  # on a detour round an obstacle
+    ESCAPING = "escaping"  # moves back from an obstacle too near ahead
 
 
 class BeaconPilot:
-    """Turns a pose, a target and the distance sensors into set points, step by step.
+    """Computes set points from a pose, a target and the distance sensors.
 
-    ``home_m``: the only place to go to, whatever the configuration says. Raises FuzzyGapError: the rules leave a gap.
+    ``home_m``: the only goal, instead of the configured ones. Raises FuzzyGapError: the rules leave a gap.
     """
 
     def __init__(self, cfg: RadioConfig, home_m: Point | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Driving to a point, its speed fuzzy, by PI control or constant; a zero-order Sugeno controller; a loop of points."""
+"""Driving to a point with fuzzy, PI-controlled or constant speed; a zero-order Sugeno controller; waypoint lists."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise, product
@@ -13,7 +13,7 @@ _Trapezoid = tuple[float, float, float, float]
 
 
 class FuzzyGapError(ValueError):
-    """No rule fires at a point: carries the inputs there."""
+    """No rule fires for some inputs, which it carries."""
 
     def __init__(self, inputs: Mapping[str, float]) -> None:
         where = ", ".join(f"{name} = {value:g}" for name, value in inputs.items())
@@ -24,9 +24,9 @@ class FuzzyGapError(ValueError):
 class Sugeno:
     """Output u = sum(w_i u_i) / sum(w_i), w_i the product of the memberships that rule i names (Takagi, Sugeno 1985).
 
-    Memberships are trapezoids. Beyond its first and last shoulder an input counts as standing there, so a rule base
-    without a gap between its corners has none anywhere. Raises FuzzyGapError: a combination of corners, or a place
-    halfway between two, where no rule fires.
+    Memberships are trapezoids. Each input is limited to the range from its first to its last shoulder, so rules without
+    a gap there have none anywhere. Raises FuzzyGapError: no rule fires at a combination of corners of the trapezoids or
+    of points halfway between corners.
     """
 
     def __init__(self, cfg: FuzzyConfig) -> None:
@@ -88,7 +88,7 @@ Point = tuple[float, float]
 
 
 class SteeringCommand(NamedTuple):
-    """Set points until the next step."""
+    """Set points, held until the next step."""
 
     speed_m_s: float
     steer_rad: float
@@ -99,26 +99,26 @@ HALT = SteeringCommand(0.0, 0.0, 0.0)
 
 
 class BearingToPoint(NamedTuple):
-    """Where to go, seen from the vehicle."""
+    """A goal relative to the vehicle."""
 
     distance_m: float
-    error_rad: float  # of the heading: positive when the aim lies to the left
+    error_rad: float  # of the heading: positive if the goal is to the left
 
 
 def aim_at(pose: PlanarPose, goal_m: Point) -> BearingToPoint:
-    """A point in the room as seen from a pose (x m, y m, heading rad)."""
+    """Distance and heading error from a pose (x m, y m, heading rad) to a point in the frame of the room."""
     dx_m, dy_m = goal_m[0] - pose[0], goal_m[1] - pose[1]
     return BearingToPoint(hypot(dx_m, dy_m), wrap_pi(bearing(dx_m, dy_m) - pose[2]))
 
 
 class WaypointSteering:
-    """From an aim to set points.
+    """Set points that drive to a goal.
 
     Steering gamma = K error, limited (Hevrdejs and Knoll 2017). A differential drive turns at K v_max / l error, which
-    is the same curve at full speed, and goes on turning in place where its speed is zero. Speed:
+    is the same curve at full speed; at zero speed it turns on the spot. Speed:
 
     * ``fuzzy``: of the distance and of the heading error's magnitude (2017).
-    * ``pi``: of the distance, slower the more the heading is off (Auth and Hovey 2018, section 2.4).
+    * ``pi``: of the distance, times the cosine of the heading error (Auth and Hovey 2018, section 2.4).
     * ``constant``: always the same (2018, as built).
 
     Raises FuzzyGapError: the rules leave a gap.
@@ -131,7 +131,7 @@ class WaypointSteering:
         self._pi, self._pi_memory = Pid(control.pi, vehicle.speed_max_m_s), PidState()
 
     def reset(self) -> None:
-        """Forget the integral: a new aim, or a stop."""
+        """Reset the integral, for a new goal or after a stop."""
         self._pi_memory = PidState()
 
     def drive(self, aim: BearingToPoint, interval_s: float) -> SteeringCommand:
@@ -139,9 +139,9 @@ class WaypointSteering:
         return self._turning(self._speed(aim, interval_s), aim.error_rad)
 
     def away(self, speed_m_s: float, error_rad: float) -> SteeringCommand:
-        """Set points that get away from what lies at ``error_rad``: backwards from what is ahead, else forwards.
+        """Set points that move away from an object at ``error_rad``: backwards if it is ahead, else forwards.
 
-        Wheels that steer turn the vehicle the other way round when it rolls backwards.
+        Steered wheels turn a vehicle in the opposite sense when it moves backwards.
         """
         speed_m_s = min(speed_m_s, self._vehicle.speed_max_m_s)
         if abs(error_rad) > pi / 2.0:
@@ -149,7 +149,7 @@ class WaypointSteering:
         return self._turning(-speed_m_s, -error_rad if self._vehicle.kind == "ackermann" else error_rad)
 
     def face(self, error_rad: float) -> SteeringCommand:
-        """Set points that turn to an aim without going there; an Ackermann vehicle cannot, and stands."""
+        """Set points that turn on the spot towards a goal; an Ackermann vehicle cannot, so it stops."""
         if self._vehicle.kind == "ackermann":
             return HALT
         return self._turning(0.0, error_rad)
@@ -175,7 +175,7 @@ class WaypointSteering:
 
 
 class WaypointList:
-    """Which waypoint is next."""
+    """Waypoints in order, and the number of those reached."""
 
     def __init__(self, waypoints_m: Sequence[Point], arrival_radius_m: float, *, loops: bool) -> None:
         self._waypoints_m = tuple(waypoints_m)
@@ -192,7 +192,7 @@ class WaypointList:
         return self._waypoints_m[self.reached % count]
 
     def visit(self, pose: PlanarPose) -> Point | None:
-        """The waypoint to go to from a pose, after counting those that are reached there."""
+        """The next waypoint, after counting those that are reached at a pose."""
         for _ in self._waypoints_m:
             goal_m = self.current_m
             if goal_m is None or aim_at(pose, goal_m).distance_m > self._radius_m:

@@ -1,6 +1,6 @@
-"""The database of a mission among beacons: waypoints as they are reached, events. Survives ``kill -9``.
+"""The database of a mission among beacons: reached waypoints and events. Survives ``kill -9``.
 
-SQLite with a rollback journal and ``synchronous=FULL``: what is committed is on the disk, the file alone is complete.
+SQLite with a rollback journal and ``synchronous=FULL``: committed rows are on the disk, and the one file is complete.
 """
 
 import sqlite3
@@ -20,7 +20,7 @@ CREATE TABLE event (t_s REAL NOT NULL, level TEXT NOT NULL, text TEXT NOT NULL);
 
 
 class BeaconStoreError(CcatpError):
-    """The database cannot be made."""
+    """The database cannot be created."""
 
     exit_status = ExitStatus.USAGE
 
@@ -28,8 +28,8 @@ class BeaconStoreError(CcatpError):
 class BeaconStore:
     """The database of one run.
 
-    ``laps``: how often they are visited; 0 where there are none to visit. Raises BeaconStoreError: the file exists, or
-    cannot be made.
+    ``laps``: over the waypoints; 0 for a mission without waypoints. Raises BeaconStoreError: the file exists, or cannot
+    be created.
     """
 
     def __init__(self, path: Path, meta: dict[str, str], waypoints: tuple[tuple[float, float], ...], laps: int) -> None:
@@ -52,7 +52,7 @@ class BeaconStore:
             )
 
     def record_arrival(self, t_s: float, number: int, arrival: WaypointArrival) -> None:
-        """A waypoint is reached, robot time t_s; ``number`` counts over all laps."""
+        """Record a reached waypoint; ``t_s``: robot time; ``number``: counted over all laps."""
         self._db.execute(
             "UPDATE waypoint SET reached_s = ?, estimate_x_m = ?, estimate_y_m = ?, xx_m2 = ?, xy_m2 = ?, yy_m2 = ? "
             "WHERE number = ?",
@@ -60,7 +60,7 @@ class BeaconStore:
         )
 
     def record_event(self, t_s: float, level: str, text: str) -> None:
-        """Something happened."""
+        """Record an event; ``t_s``: robot time."""
         self._db.execute("INSERT INTO event VALUES (?, ?, ?)", (t_s, level, text))
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Readers of recorded radio data: Plaza, MRCLAM, Labyrinth, own CSV, signal-strength tables.
+"""Readers of recorded radio data: Plaza, MRCLAM, Labyrinth, own CSV, ROS bags, signal-strength tables.
 
-``reader.read_recording`` chooses the format; every problem names file and line.
+``reader.read_run`` chooses the format; every message names the file and, if possible, the line.
 """

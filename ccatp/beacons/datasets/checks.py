@@ -1,4 +1,4 @@
-"""What looks wrong in a recorded run, a line each: units, gaps, readings and odometry against truth and survey."""
+"""Warnings about a recorded run: units, gaps, readings and odometry against truth and survey."""
 
 from collections.abc import Generator, Iterator, Mapping
 from itertools import combinations
@@ -16,21 +16,21 @@ from ccatp.filters.metrics import aligned_rms_m
 MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
 SCALE_WARNING = 0.03
 OFFSET_WARNING_M = 0.1
-STRANGER_M = 0.3  # readings of a beacon are strange if half of them miss its place by that,
-STRANGER_RATIO = 5.0  # and by that many times what the others miss
-FITTING = 0.3  # of what they miss their own place by: then they fit another,
-EXCHANGED = 0.75  # or, if those of the other fit here as well as theirs there, are exchanged with it
-EXCHANGE_FACTOR = 1.5  # times what the others miss, without which nothing is exchanged
-AGREEMENT = 0.5  # length of the mean vector of bearing errors that share a constant
-CLOSE = 0.9  # the same, of bearings that give places
-PIECES = 4  # of the run, looked at one by one
+STRANGER_M = 0.3  # readings of a beacon are suspicious if their median miss of its position is larger,
+STRANGER_RATIO = 5.0  # also relative to the usual miss of the beacons
+FITTING = 0.3  # readings fit another position if they miss it by less than this share of the miss of their own
+EXCHANGED = 0.75  # two beacons are exchanged if the readings of each fit the other position by this share,
+EXCHANGE_FACTOR = 1.5  # and miss their own position by this many times the usual miss
+AGREEMENT = 0.5  # length of the mean vector of bearing errors above which they have a common constant
+CLOSE = 0.9  # the same, above which bearings are good enough to compute positions
+PIECES = 4  # of the run, checked separately
 FEW = 20
-FITS = " fit "  # in a line that says whose place it is
+FITS = " fit "  # in a warning that names the fitting position
 LENGTHS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048))
 
 
 def readings_against(run: RecordedRun, truth: ReferencePath) -> Iterator[str]:
-    """What looks wrong in readings where truth and places are known."""
+    """Warnings about readings while the truth is known, of beacons with known positions."""
     placed = np.array([run.beacon_truth_m.get(name, (np.nan, np.nan)) for name in run.beacon_ids]).reshape(-1, 2)
     r, t = run.readings, run.readings.times_s
     inside = (t >= truth.times_s[0]) & (t <= truth.times_s[-1]) & np.isfinite(r.range_m)
@@ -106,7 +106,8 @@ def _misplaced(
         rows = (seen.times_s >= edges[piece]) & (seen.times_s <= edges[piece + 1])
         now, there = seen.where(rows), pose[rows]
         for line, beacons in _unlike(names, _misses(placed, now, there), _misses(placed, now, there, off_rad)).items():
-            if FITS in line and not explained.intersection(beacons):  # a few readings may all be off: no misses
+            # Only a fit to another position counts: in a short piece all readings may happen to miss.
+            if FITS in line and not explained.intersection(beacons):
                 parts.setdefault(line.split(" (by ")[0], []).append(piece)
                 partly.update(beacons)
     yield from (line for line, beacons in whole.items() if not partly.intersection(beacons))
@@ -116,9 +117,10 @@ def _misplaced(
 
 
 def _misses(placed: FloatArray, seen: Readings, pose: FloatArray, off_rad: float | None = None) -> FloatArray:
-    """Median miss, m, of the readings of one beacon at the place of another, shape (n, n); NaN where there are few.
+    """Median miss, m, of the readings of beacon i at the position of beacon j, shape (n, n); NaN for few readings.
 
-    With the constant error of the bearings it is that of the place where they point, else that of the range.
+    With ``off_rad``, the constant error of the bearings, it is the miss of the position from range and bearing, else of
+    the range.
     """
     count = len(placed)
     miss = np.full((count, count), np.nan)
@@ -169,18 +171,18 @@ def _own_and_usual(miss: FloatArray) -> tuple[FloatArray, float]:
 
 
 TRUTH_GAP_S = 1.0
-SAME = 0.01  # odometry is the truth itself if single steps agree to that part of their size
+SAME = 0.01  # odometry is a copy of the truth if single steps differ by a smaller share
 TURN_WARNING = 0.05
-STANDS = 0.01  # of what the other moves
+STANDS = 0.01  # share of the other's motion, below which odometry or truth does not move
 STANDS_M = 0.2
 LIKE = 0.3
 LEAST_TURNING_RAD2 = 0.1
-FASTEST_TURN_RAD_S = 10.0  # faster turning is a unit's fault
+FASTEST_TURN_RAD_S = 10.0  # a faster turn means a wrong unit
 FASTEST_M_S = 50.0
 
 
 def suspicions(run: RecordedRun) -> list[str]:
-    """Everything that looks wrong, the most basic first."""
+    """All warnings, the most basic first."""
     found = [*_gaps(run), *_units(run), *_signs(run.readings)]
     if run.truth is not None:
         against = list(_standing(run.truth, run.steps)) or list(_odometry_against(run.truth, run.steps))
@@ -295,7 +297,7 @@ def _copied_odometry(truth: ReferencePath, steps: Steps) -> Iterator[str]:
 
 
 def _turning_against(truth: ReferencePath, steps: Steps, rows: npt.NDArray[np.int64]) -> Iterator[str]:
-    """Turns by the truth's heading over those of the odometry; by the shape of the path if the truth has none."""
+    """Warnings about turns of the odometry, from the heading of the truth, or else from the shape of its path."""
     if not np.isfinite(truth.heading_rad).all():
         factor = turning_factor(truth, steps)
         if factor is not None:
@@ -327,18 +329,18 @@ def _map_of(run: RecordedRun) -> Iterator[str]:
         yield f"surveyed beacons without any reading: {', '.join(unread)}"
 
 
-MISSED = 5.0  # times what a map expects to miss the survey by: then something is wrong
-MENDED = 0.3  # of the misfit of map and survey that is left once the right place is changed
+MISSED = 5.0  # times the expected difference of map and survey, above which one of them is wrong
+MENDED = 0.3  # a changed position explains the difference if at most this share of it remains
 
 
 def survey_doubts(track: EstimatedPath, surveyed_m: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Two beacons that the survey has exchanged, or one that was moved: where a map fits far better without.
+    """A warning of two exchanged beacons or one moved beacon in the survey, if the map fits far better without.
 
-    Else that the map misses the survey by more than its covariance allows. For runs without a reference trajectory,
-    where nothing else says so. Map and survey are in frames of their own.
+    Otherwise a warning if map and survey differ by more than the covariance of the map explains. For runs without a
+    reference trajectory, which have no other check. Map and survey may be in different frames.
     """
     names = [name for name in track.beacons if name in surveyed_m]
-    if len(names) < 4:  # any three places fit three others too well
+    if len(names) < 4:  # three positions fit any three others too well
         return []
     found = np.array([track.beacons[name][:2] for name in names])
     surveyed = np.array([surveyed_m[name] for name in names])

@@ -1,4 +1,4 @@
-"""Recorded runs: Plaza (CMU), MRCLAM (UTIAS), Labyrinth (TU Chemnitz), and a CSV of our own with an event a line."""
+"""Recorded runs: Plaza (CMU), MRCLAM (UTIAS), Labyrinth (TU Chemnitz), and our own CSV with one event per line."""
 
 import math
 import re
@@ -38,7 +38,7 @@ NO_RANGE = "no range within the time of the odometry"
 
 
 def _truth(reference: Table | None, steps: Steps, warnings: list[str]) -> ReferencePath | None:
-    """The trajectory of rows of time, x, y and heading; of positions alone where headings are missing."""
+    """The trajectory from rows of time, x, y and heading; without headings if one is missing."""
     if reference is None:
         return None
     t, x, y, *more = reference.values.T
@@ -54,7 +54,7 @@ def _run(
     name: str, kind: str, steps: Steps, received: FloatArray, places_m: dict[str, tuple[float, float]],
     truth: ReferencePath | None, warnings: list[str],
 ) -> RecordedRun:  # fmt: skip
-    """``received``: time, number of the beacon, range and, if there are any, bearing, shape (m, 3 or 4)."""
+    """``received``: time, number of the beacon, range and, optionally, bearing, shape (m, 3 or 4)."""
     ids, index = np.unique(received[:, 1].astype(np.int64), return_inverse=True)
     unknown = np.full(len(received), np.nan)
     bearing_rad = received[:, 3] if received.shape[1] > 3 else unknown
@@ -89,11 +89,11 @@ PLAZA = {
     "TL": ("beacon", "x [m]", "y [m]"),
 }
 PLAZA_NEEDED = ("DR", "TD")
-NESTED = ("cell", "struct", "object")  # classes of MATLAB that can hold any number of others
+NESTED = ("cell", "struct", "object")  # MATLAB classes that can contain others without limit
 
 
 def is_plaza(file: Path) -> bool:
-    """Whether the file's name is one of a Plaza set."""
+    """Whether the name of the file is that of a Plaza set."""
     return file.suffix == ".mat" or any(f"_{kind}.txt" in file.name for kind in PLAZA)
 
 
@@ -101,8 +101,8 @@ def read_plaza(path: Path) -> RecordedRun:
     """Read a Plaza set (Djugash, Hamner, Roth, JFR 2009): odometry (DR), ranges (TD), beacons (TL) and truth (GT).
 
     ``path``: the ``.mat``; or one of the texts ``NAME_DR.txt``, ``NAME_TD.txt``, ``NAME_GT.txt``, ``NAME_TL.txt``
-    (plain or gzipped; the last two may be missing); or a folder with one set, whose ``.mat`` goes before texts. Raises
-    RadioDataError: a file is missing or is not what it should be.
+    (plain or gzipped; the last two are optional); or a folder with one set, of which a ``.mat`` is preferred. Raises
+    RadioDataError: a file is missing or invalid.
     """
     file = _plaza_file(path) if path.is_dir() else path
     tables = _mat_tables(file) if file.suffix == ".mat" else _text_tables(file)
@@ -132,11 +132,11 @@ def _plaza_file(folder: Path) -> Path:
 
 
 def _mat_tables(file: Path) -> dict[str, Table]:
-    from scipy.io import loadmat, whosmat  # noqa: PLC0415 -- slow to import, and texts need none of it
+    from scipy.io import loadmat, whosmat  # noqa: PLC0415 -- slow to import, and not needed for texts
     from scipy.io.matlab import MatReadError  # noqa: PLC0415
 
     try:
-        read_input(file, MOST_DATA_BYTES)  # which refuses what is no file, or too long
+        read_input(file, MOST_DATA_BYTES)  # only to refuse a path that is not a file, or is too long
         for name, shape, form in whosmat(file):
             if name in PLAZA and (form in NESTED or math.prod(shape) > MOST_DATA_BYTES // 8):
                 raise RadioDataError(file, f"variable {name} is no table of at most {MOST_DATA_BYTES} bytes")
@@ -177,7 +177,7 @@ def _text_tables(file: Path) -> dict[str, Table]:
 
 
 def _plaza_steps(file: Path, odometry: Table, truth_start_s: float | None) -> Steps:
-    # Each row is the way since the row before; the first since the truth's first pose.
+    # Each row is the motion since the previous row; the first row that since the first pose of the truth.
     t, distance, turn = odometry.values.T
     odometry._replace(file=file).check_steps("odometry rows")
     usual_s = float(np.median(np.diff(t)))
@@ -201,11 +201,11 @@ def robots_in(folder: Path) -> list[int]:
 
 
 def read_mrclam(path: Path, robot: int | None) -> RecordedRun:
-    """Read one robot's run: odometry and a camera that sees barcodes on landmarks and robots.
+    """Read the run of one robot: odometry, and ranges and bearings of a camera to barcodes on landmarks.
 
-    ``path``: the folder, or one of its ``RobotN_...`` files (which then names the robot); plain or gzipped. ``robot``:
-    number of the robot; the first that is there if ``None``. Raises RadioDataError: there is no such robot, a file is
-    missing or is not what it should be.
+    ``path``: the folder, or one of its ``RobotN_...`` files (which then selects the robot); plain or gzipped.
+    ``robot``: number of the robot; the lowest if ``None``. Raises RadioDataError: there is no such robot, or a file is
+    missing or invalid.
     """
     folder = path
     if path.is_file():
@@ -240,7 +240,7 @@ def read_mrclam(path: Path, robot: int | None) -> RecordedRun:
 
 
 def _subjects(folder: Path, barcodes: FloatArray, warnings: list[str]) -> FloatArray:
-    """Subject of each reading, 0 where the barcode is not listed; shape (m,)."""
+    """Subject of each reading, 0 if the barcode is not listed; shape (m,)."""
     file = _needed(folder, "Barcodes.dat", "readings name barcodes, and it says whose they are")
     table = read_table(file, ("subject", "barcode"))
     subject_of = {int(barcode): int(subject) for subject, barcode in table.values.tolist()}
@@ -263,8 +263,8 @@ def _landmarks(folder: Path, warnings: list[str]) -> dict[str, tuple[float, floa
 
 
 TRACK_WARNING = 0.2
-# The readme calls the wheel columns right, left and the fourth the distance between the wheels; the numbers say left,
-# right, and half that distance (see ``_wheel_columns``).
+# The readme of the set calls the columns right wheel, left wheel and distance between the wheels. The data show that
+# they are left wheel, right wheel and half that distance (see ``_wheel_columns``).
 LABYRINTH = {
     "range2": ("time [s]", "range [m]", "sigma [m]", "anchor x [m]", "anchor y [m]", "anchor"),
     "odom2diff": (
@@ -276,15 +276,15 @@ LABYRINTH = {
 
 
 def is_labyrinth(text: str) -> bool:
-    """Whether the text's first line is one of the set's."""
+    """Whether the first line of a text is of the Labyrinth set."""
     lines = content_lines(text[:4096])
     return bool(lines) and lines[0][1].split()[0] in LABYRINTH
 
 
 def read_labyrinth(path: Path) -> RecordedRun:
-    """Read a Labyrinth text, plain or gzipped: UWB ranges, wheel speeds and positions, a line each.
+    """Read a Labyrinth text, plain or gzipped: a line is a UWB range, wheel speeds, or a true position.
 
-    Raises RadioDataError: a line is not one of the set's, or there is no odometry or no range.
+    Raises RadioDataError: a line has another form, or there is no odometry or no range.
     """
     file = _labyrinth_file(path) if path.is_dir() else path
     warnings: list[str] = []
@@ -313,7 +313,7 @@ def read_labyrinth(path: Path) -> RecordedRun:
 
 
 def _wheel_columns(truth: ReferencePath, steps: Steps, half_track_m: float) -> list[str]:
-    """What the truth says of the wheel columns, read as left, right, half the track; nothing where it says little."""
+    """Check, by the truth, that the wheel columns are left, right, half the track; empty if the truth cannot decide."""
     factor = turning_factor(truth, steps)
     if factor is None:
         return []
@@ -333,7 +333,7 @@ def _labyrinth_file(folder: Path) -> Path:
     return files[0]
 
 
-# Columns after the event's name, as docs/radio_data.md lists them.
+# Columns after the name of the event; see docs/radio_data.md.
 EVENTS = {
     "odom": ("time_s", "distance_m", "turn_rad", "(lateral_m)"),
     "range": ("time_s", "beacon", "range_m"),
@@ -348,7 +348,7 @@ HEADER = "event"
 
 
 def is_events_csv(text: str) -> bool:
-    """Whether the text's first line, or the second below one of words, is an event or the header."""
+    """Whether the first line of a text is an event or the header, or the second line, if the first has only words."""
     lines = [split_cells(content) for _, content in content_lines(text[:4096])[:2]]
     if lines and not any(is_number(cell) for cell in lines[0]):
         return any(cells[0] in (*EVENTS, HEADER) for cells in lines)
@@ -358,7 +358,7 @@ def is_events_csv(text: str) -> bool:
 def read_events_csv(file: Path) -> RecordedRun:
     """Read a run from a CSV of events (docs/radio_data.md), plain or gzipped.
 
-    Raises RadioDataError: a line is no event, or there is no odometry or no reading of a beacon.
+    Raises RadioDataError: a line is not an event, or there is no odometry or no reading of a beacon.
     """
     if file.is_dir():
         raise RadioDataError(file, "is a folder: name the CSV file in it")
@@ -373,7 +373,7 @@ def read_events_csv(file: Path) -> RecordedRun:
 
 
 def run_of_events(file: Path, tables: dict[str, Table], names: tuple[str, ...]) -> RecordedRun:
-    """A run from a table for each of ``EVENTS`` that there are; ``names``: of the beacons, which tables number.
+    """A run from a table for each kind of event; ``names``: of the beacons, which the tables give as indices.
 
     The path is that of the antenna. Raises RadioDataError: there is no odometry or no reading of a beacon.
     """
@@ -421,7 +421,7 @@ def _antenna(mounted: Table | None) -> tuple[float, float, float]:
 
 
 def _in_the_plane(readings: Readings, above_m: FloatArray, warnings: list[str]) -> Readings:
-    """Ranges without what heights add to them. ``above_m``: of each beacon over the antenna, shape (b,)."""
+    """Ranges projected to the plane. ``above_m``: height of each beacon above the antenna, shape (b,)."""
     squares = readings.range_m**2 - above_m[readings.beacon] ** 2
     if (short := (squares < 0.0) & (readings.range_m > 0.0)).any():
         warnings.append(f"{plural(int(short.sum()), 'range')} shorter than the beacon is above the antenna, left out")
@@ -432,7 +432,7 @@ def _in_the_plane(readings: Readings, above_m: FloatArray, warnings: list[str]) 
 
 
 def _event_steps(odometry: Table) -> Steps:
-    # Each row is the way since the row before; of the first row only its time counts.
+    # Each row is the motion since the previous row; only the time of the first row is used.
     t, distance, turn, lateral = odometry.values.T
     odometry.check_steps("events odom")
     if (np.diff(t) <= 0.0).any():
@@ -444,7 +444,7 @@ def _event_steps(odometry: Table) -> Steps:
 def _merged(
     tables: dict[str, Table], steps: Steps, names: tuple[str, ...], warnings: list[str]
 ) -> tuple[Readings, tuple[str, ...]]:
-    """Readings, with range, bearing and strength of the same time and beacon in one row, and the beacons' names."""
+    """Readings with range, bearing and strength of one beacon at one time in one row, and the names of the beacons."""
     merged: dict[tuple[float, float], list[float]] = {}
     extra: list[tuple[float, float, list[float]]] = []
     for place, kind in enumerate(READING_KINDS):
@@ -455,7 +455,7 @@ def _merged(
             row = merged.setdefault((t, who), [np.nan] * len(READING_KINDS))
             if np.isnan(row[place]):
                 row[place] = value
-            else:  # twice at the same time
+            else:  # a second value of this kind at the same time
                 extra.append((t, who, [value if k == place else np.nan for k in range(len(READING_KINDS))]))
     rows = sorted([(t, who, row) for (t, who), row in merged.items()] + extra, key=lambda item: item[:2])
     beacons, index = np.unique([int(who) for _, who, _ in rows], return_inverse=True)

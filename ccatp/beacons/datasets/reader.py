@@ -1,4 +1,4 @@
-"""Reads a recorded run of any format: which format it is, numbers that cannot be, and what looks wrong in it."""
+"""Reads a recorded run of any format: detects the format, rejects impossible values, and warns of suspicious ones."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from ccatp.beacons.datasets.tables import RadioDataError, content_lines, plural,
 from ccatp.beacons.slam.recording import RecordedRun
 from ccatp.core import FloatArray
 
-LEAST_TRUTH = 2  # rows: one fits any path
+LEAST_TRUTH = 2  # rows; a single position fits any path
 READERS = {"plaza": read_plaza, "labyrinth": read_labyrinth, "csv": read_events_csv}
 FORMATS = ("plaza", "mrclam", "labyrinth", "csv", "bag")
 
@@ -31,8 +31,8 @@ FORMATS = ("plaza", "mrclam", "labyrinth", "csv", "bag")
 def read_run(path: Path, data_format: str | None, robot: int | None, topics_file: Path | None = None) -> RecordedRun:
     """Read and check a recorded run.
 
-    ``data_format``: one of ``FORMATS``; found out from the files if ``None``. ``topics_file``: of a bag. Raises
-    RadioDataError: it cannot be read, or is not what it claims to be.
+    ``data_format``: one of ``FORMATS``; detected from the files if ``None``. ``topics_file``: only for a bag. Raises
+    RadioDataError: it cannot be read, or does not have the format.
     """
     data_format = found_format(path, data_format)
     if robot is not None and data_format != "mrclam":
@@ -44,7 +44,7 @@ def read_run(path: Path, data_format: str | None, robot: int | None, topics_file
 
 
 def checked_run(run: RecordedRun, path: Path) -> RecordedRun:
-    """The run without what cannot be, with warnings of what looks wrong (raises RadioDataError: nothing is left)."""
+    """The run without impossible values, with warnings of suspicious ones. Raises RadioDataError: nothing is left."""
     run = _bounded(run, path)
     if run.truth is not None and len(run.truth.times_s) < LEAST_TRUTH:
         warning = (
@@ -56,7 +56,7 @@ def checked_run(run: RecordedRun, path: Path) -> RecordedRun:
 
 
 def found_format(path: Path, given: str | None = None) -> str:
-    """Which format a file or folder has: the one given, or else by its names and its first line.
+    """The format of a file or folder: the given one, or else by file names and the first line.
 
     Raises RadioDataError: it does not exist, is empty, or has none of the formats.
     """
@@ -86,9 +86,9 @@ def found_format(path: Path, given: str | None = None) -> str:
 
 
 LONGEST_RUN_S = 1e8  # three years
-LONGEST_PAUSE_S = 3600.0  # of the odometry; a longer one is a clock that was set
+LONGEST_PAUSE_S = 3600.0  # of the odometry; a longer one means that the clock was set
 LONGEST_STEP_M = 1e3  # between two rows of odometry
-LARGEST_TURN_RAD = 1e4  # likewise; degrees for radians stay far below it, and are reported elsewhere
+LARGEST_TURN_RAD = 1e4  # between two rows; degrees instead of radians stay far below, and are reported elsewhere
 FARTHEST_M = 1e8  # of coordinates; those of maps reach 1e7
 # Column of the readings, its name, the largest value and its unit.
 LIMITS = (
@@ -99,9 +99,9 @@ LIMITS = (
 
 
 def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
-    """The run without readings and surveyed places that cannot be; each kind that was left out makes a warning.
+    """The run without impossible readings and surveyed positions; each kind that is dropped gives a warning.
 
-    Odometry and truth are refused as a whole: without one of its steps a path leads elsewhere.
+    Odometry and truth are refused as a whole, because without one of its steps a path is wrong.
     """
     steps, truth = run.steps, run.truth
     _refuse(where, "time of odometry", steps.times_s - steps.times_s[0], LONGEST_RUN_S, "s after its first row")
@@ -117,7 +117,7 @@ def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
             _refuse(where, f"truth: {name}", column, FARTHEST_M, "m", truth.times_s)
     left_out: list[str] = []
     readings = run.readings
-    if (nothing := readings.range_m == 0.0).any():  # what units write that received no answer
+    if (nothing := readings.range_m == 0.0).any():  # some units write 0 if they received no reply
         first_s = readings.times_s[np.argmax(nothing)]
         left_out.append(f"{plural(int(nothing.sum()), 'range')} of 0 m, the first at {first_s:.6g} s, left out")
         readings = readings._replace(range_m=np.where(nothing, np.nan, readings.range_m))

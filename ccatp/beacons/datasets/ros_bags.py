@@ -1,6 +1,6 @@
 """A recorded run from a ROS bag (``.bag``, ``.db3``, ``.mcap``, a ROS 2 folder), with a file that names its topics.
 
-Needs the extra ``ros`` (rosbags), which reads the bag's own message definitions, so that topics of any type will do.
+Needs the extra ``ros`` (rosbags). It reads the message definitions in the bag, so topics of any type are accepted.
 """
 
 import tomllib
@@ -25,19 +25,19 @@ _Place = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
 
 
 class OdometryTopic(Model):
-    """Poses of the vehicle in any frame that drifts, or velocities that hold until the next message."""
+    """Poses of the vehicle in a drifting frame, or velocities that are held until the next message."""
 
     topic: str
     use: Literal["pose", "twist"] = "pose"
 
 
 class ReadingsTopic(Model):
-    """Readings of beacons; a field is named by its path in the message, as in ``header.frame_id``."""
+    """Readings of beacons; fields are given as paths in the message, for example ``header.frame_id``."""
 
     topic: str
-    each: str = ""  # field with a list of readings, where a message has several
-    beacon: str = ""  # field that names the beacon,
-    name: str = ""  # or its name, where the topic has one alone
+    each: str = ""  # field with the list of readings, if a message has several
+    beacon: str = ""  # field with the name of the beacon,
+    name: str = ""  # or the name itself, if all readings of the topic are of one beacon
     range: str = ""
     bearing: str = ""
     rssi: str = ""
@@ -50,19 +50,19 @@ class TruthTopic(Model):
 
 
 class Topics(Model):
-    """What is where in a bag."""
+    """The topics of a bag, and data that it lacks."""
 
     odometry: OdometryTopic
     readings: list[ReadingsTopic]
     truth: TruthTopic | None = None
-    antenna_m: _Place = (0.0, 0.0, 0.0)  # ahead, left, up of the vehicle's origin
+    antenna_m: _Place = (0.0, 0.0, 0.0)  # forward, left and up from the origin of the vehicle
     beacons: dict[str, _Place] = Field(default_factory=dict)
 
 
 def read_bag(path: Path, topics_file: Path | None) -> RecordedRun:
-    """Read a run. Times are those of the messages' headers, of the recorder where there is none.
+    """Read a run. Times are those of the message headers, or of the recorder for messages without one.
 
-    Raises RadioDataError: rosbags is not installed, or the bag or its topics are not what they should be.
+    Raises RadioDataError: rosbags is not installed, or the bag or its topics are invalid.
     """
     if topics_file is None:
         raise RadioDataError(path, "is a bag: give a TOML file that names its topics with --topics")
@@ -77,7 +77,7 @@ def read_bag(path: Path, topics_file: Path | None) -> RecordedRun:
 
 
 def read_topics(file: Path) -> Topics:
-    """The topics that a file names (raises RadioDataError: it is no such file)."""
+    """Read the file of topics. Raises RadioDataError: it is not valid."""
     try:
         return Topics.model_validate(tomllib.loads(read_input(file, _MOST_TOPICS_BYTES).decode()))
     except ValidationError as error:
@@ -131,7 +131,7 @@ def _messages(path: Path, wanted: set[str]) -> Iterator[tuple[str, float, Any]]:
                 yield connection.topic, 1e-9 * time_ns, reader.deserialize(raw, connection.msgtype)
     except RadioDataError:
         raise
-    except Exception as error:  # what rosbags and its parsers raise on damaged bags is of many kinds
+    except Exception as error:  # rosbags and its parsers raise many types on damaged bags
         raise RadioDataError(path, f"is no bag that can be read: {' '.join(str(error).split())[:200]}") from error
 
 
@@ -152,7 +152,7 @@ def _field(message: Any, path: str) -> Any:
 
 
 def _pose(message: Any) -> tuple[float, float, float]:
-    """x_m, y_m, heading_rad of a pose, a transform or a point, however deep it lies; NaN for what is not there."""
+    """x_m, y_m, heading_rad of a pose, transform or point, also if nested; heading NaN for a point."""
     for part in ("transform", "pose", "pose", "point"):
         message = getattr(message, part, message)
     place = next((getattr(message, part) for part in ("translation", "position") if hasattr(message, part)), message)
@@ -170,7 +170,7 @@ def _velocity(message: Any) -> tuple[float, float, float]:
 
 
 def _moved(last: tuple[float, ...], now: tuple[float, ...], use: str) -> list[float]:
-    """A row of odometry: time, way forward, turn, way to the left, since the message before."""
+    """A row of odometry: time; then motion forward, turn, and motion to the left since the previous message."""
     before_s, *before = last
     time_s, *values = now
     if use == "twist":

@@ -1,4 +1,4 @@
-"""Sheets with a head that names the columns: signal levels by distance or place, ranges between motes, their places.
+"""Sheets with a header row: signal levels by distance or position, ranges between motes, positions of motes.
 
 CSV, sheets of a workbook, and folders of XBee logs ("Node A: -56"). Maps of beacons are written as TOML.
 """
@@ -22,7 +22,7 @@ from ccatp.beacons.slam.path_loss import LevelPair
 from ccatp.config.files import read_input
 from ccatp.core import FloatArray
 
-# A table that people measured is smaller, a decompression bomb is not.
+# Limits against decompression bombs; manually measured tables are smaller.
 _MOST_BOOK_BYTES, _MOST_CELLS = 5_000_000, 500_000
 
 # What zipfile, zlib, the XML parser and openpyxl raise on damaged files.
@@ -33,7 +33,7 @@ _DAMAGE = (
 
 
 class Sheet(NamedTuple):
-    """The head of a sheet, and its other rows with the number of the line of each, from 1."""
+    """The header of a sheet, and its other rows with their line numbers, from 1."""
 
     path: Path
     name: str
@@ -41,16 +41,16 @@ class Sheet(NamedTuple):
     rows: list[tuple[int, list[str]]]
 
     def column(self, pattern: re.Pattern[str], what: str) -> int:
-        """The first column whose head matches. Raises RadioDataError: none does."""
+        """The first column whose header matches. Raises RadioDataError: none does."""
         found = next((i for i, cell in enumerate(self.head) if pattern.search(cell)), None)
         if found is None:
             raise RadioDataError(self.path, f"has no column of {what}; its columns are {', '.join(self.head)}", 1)
         return found
 
     def numbers(self, *columns: int) -> list[list[float]]:
-        """The numbers in some columns, a row each.
+        """The numbers in some columns, row by row.
 
-        Raises RadioDataError: one is no number, or larger than any level or place.
+        Raises RadioDataError: a cell is not a number, or too large for a level or a coordinate.
         """
         found = []
         for line, row in self.rows:
@@ -64,9 +64,9 @@ class Sheet(NamedTuple):
 
 
 def read_sheet(path: Path, sheet: str | None = None) -> Sheet:
-    """A CSV file with commas, semicolons, tabs or white space, or a sheet of a workbook, the first if not named.
+    """Read a CSV file with commas, semicolons, tabs or white space, or a sheet of a workbook (default: the first).
 
-    Raises RadioDataError: it cannot be read, or holds no rows below a head.
+    Raises RadioDataError: it cannot be read, or has no rows below the header.
     """
     if path.suffix.lower() == ".xlsx":
         sheets = read_workbook(path)
@@ -88,11 +88,11 @@ def read_sheet(path: Path, sheet: str | None = None) -> Sheet:
 
 
 def read_workbook(file: Path) -> dict[str, list[list[str]]]:
-    """Rows of cells by name of the sheet, in the workbook's order; empty cells are empty text.
+    """Rows of cells by name of the sheet, in the order of the workbook; empty cells are empty strings.
 
-    Raises RadioDataError: it is missing or no workbook.
+    Raises RadioDataError: it is missing, or not a workbook.
     """
-    from openpyxl import load_workbook  # noqa: PLC0415 - the other formats do not wait for it
+    from openpyxl import load_workbook  # noqa: PLC0415 - slow to import, and not needed for other formats
 
     found: dict[str, list[list[str]]] = {}
     cells = 0
@@ -129,17 +129,17 @@ _LEVEL = re.compile(r"rssi|level|dbm", re.IGNORECASE)
 _LEVEL_OF = re.compile(r"(?:rssi|level)[\s_]+(?P<node>\S+)", re.IGNORECASE)
 _POINT = re.compile("point", re.IGNORECASE)
 _DISTANCES = "distances, as distance_m"
-_LARGEST = 1e5  # of metres as of dBm
+_LARGEST = 1e5  # m or dBm
 
 Levels = tuple[str, tuple[LevelPair, ...], list[str]]
 LevelsByPlace = tuple[str, tuple[MeasuredPlace, ...], list[str]]
 
 
 def read_levels(path: Path, sheet: str | None = None, points: Path | None = None) -> Levels:
-    """Pairs of distance (m) and level (dBm) of a sheet, or XBee logs with a table of their ``points``.
+    """Pairs of distance (m) and level (dBm) from a sheet, or from a folder of XBee logs with a table of ``points``.
 
-    Returns name of the data, the pairs, and what was odd about them. Raises RadioDataError: it cannot be read, or has
-    no such columns.
+    Returns the name of the data, the pairs, and warnings. Raises RadioDataError: it cannot be read, or lacks the
+    columns.
     """
     if path.is_dir():
         return _read_logs(path, sheet, points)
@@ -150,9 +150,9 @@ def read_levels(path: Path, sheet: str | None = None, points: Path | None = None
 
 
 def read_level_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
-    """Places and levels: columns ``x``, ``y`` (m) and ``RSSI A``, ``RSSI B``, ... (dBm); see ``read_levels``.
+    """Positions and levels: columns ``x``, ``y`` (m) and ``RSSI A``, ``RSSI B``, ... (dBm); see ``read_levels``.
 
-    Raises RadioDataError: it cannot be read, or has no such columns.
+    Raises RadioDataError: it cannot be read, or lacks the columns.
     """
     table = read_sheet(path, sheet)
     nodes = {match["node"]: i for i, cell in enumerate(table.head) if (match := _LEVEL_OF.fullmatch(cell))}
@@ -168,9 +168,9 @@ def read_level_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
 
 
 def read_log(file: Path) -> dict[str, list[float]]:
-    """Levels by node of an XBee log with lines as ``Node A: -56``.
+    """Levels by node from an XBee log with lines like ``Node A: -56``.
 
-    Raises RadioDataError: it cannot be read, or a line is none of these.
+    Raises RadioDataError: it cannot be read, or has another line.
     """
     found: dict[str, list[float]] = {}
     for line, content in content_lines(read_text(file)):
@@ -209,17 +209,17 @@ PLAIN = ("first", "second", "range_m")
 SESSION = ("session", "pos", "deg", "anchor", "tag", "mean_m")
 PLACES = ("name", "x_m", "y_m")
 LONGEST_M = 1e6
-SHORTEST_M = 1e-3  # no two motes are nearer
-FINEST_M = 1e-6  # no range is better
+SHORTEST_M = 1e-3  # smallest range between motes
+FINEST_M = 1e-6  # smallest sigma of a range
 
 
 def read_ranges(path: Path, sigma_m: float) -> MeasuredRanges:
-    """Ranges of a sheet.
+    """Read the ranges of a sheet, in one of two forms.
 
-    Two forms are read. ``first,second,range_m`` with ``sigma_m`` where ranges differ in quality: one range a line.
-    ``session,pos,deg,anchor,tag,n,mean_m,...``: a trolley with tags among anchors, one line for the mean range of an
-    anchor to a tag while the trolley stood at a position with a heading; tags of one standstill move together. Raises
-    RadioDataError: it cannot be read, or a line is no range.
+    ``first,second,range_m`` and optionally ``sigma_m``: one range per line.
+    ``session,pos,deg,anchor,tag,n,mean_m,...``: a trolley with tags among anchors; each line is the mean range from an
+    anchor to a tag while the trolley stood at a position and heading. Tags of one such pose form a rigid body.
+    ``sigma_m``: for ranges without their own. Raises RadioDataError: it cannot be read, or a line is not a range.
     """
     table = read_sheet(path)
     is_session = set(SESSION) <= set(table.head)
@@ -245,9 +245,9 @@ def read_ranges(path: Path, sigma_m: float) -> MeasuredRanges:
 
 
 def read_places(path: Path) -> dict[str, tuple[float, ...]]:
-    """Places of motes by name: a sheet with ``name,x_m,y_m`` and, in space, ``z_m``.
+    """Positions of motes by name, from a sheet with ``name,x_m,y_m`` and, in three dimensions, ``z_m``.
 
-    Raises RadioDataError: it cannot be read, or a line is no place.
+    Raises RadioDataError: it cannot be read, or a line is not a position.
     """
     table = read_sheet(path)
     _check_columns(table, PLACES, "[,z_m]")

@@ -1,4 +1,4 @@
-"""Tables of numbers in text files, plain or gzipped: faults carry file and line; order and completeness of rows."""
+"""Tables of numbers in text files, plain or gzipped; errors name file and line; checks of order and completeness."""
 
 import csv
 import gzip
@@ -17,7 +17,7 @@ from ccatp.errors import CcatpError, ExitStatus
 
 
 class RadioDataError(CcatpError):
-    """A data set that cannot be used: the file, the number of the line from 1, what is wrong."""
+    """A data set that cannot be used: file, line number from 1, problem."""
 
     exit_status = ExitStatus.USAGE
 
@@ -25,12 +25,12 @@ class RadioDataError(CcatpError):
         super().__init__(f"{where}:{line}: {problem}" if line is not None else f"{where}: {problem}")
 
 
-MOST_DATA_BYTES = 50_000_000  # the longest known recording has 10 MB; a decompression bomb has more
+MOST_DATA_BYTES = 50_000_000  # against decompression bombs; the longest known recording has 10 MB
 LONGEST_ROW = 20_000  # characters
 GZIP_MAGIC = b"\x1f\x8b"
 COMMENTS = ("#", "%", "//")
-GAP_S = 2.0  # pauses shorter than that are how recorders work,
-GAP_RATIO = 20.0  # and so are those of a few usual intervals
+GAP_S = 2.0  # shorter pauses are normal for recorders,
+GAP_RATIO = 20.0  # and so are pauses of fewer usual intervals
 
 
 def plural(count: int, what: str) -> str:
@@ -39,14 +39,14 @@ def plural(count: int, what: str) -> str:
 
 
 def listed(names: Sequence[str], most: int = 8) -> str:
-    """``6, 7, 8``, shortened where there are many."""
+    """``6, 7, 8``, shortened if there are more than ``most``."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam, labyrinth or csv") -> str:
-    """The text of a file, unpacked if it is gzipped, whatever its name.
+    """The text of a file; a gzipped file, of any name, is unpacked.
 
-    Raises RadioDataError: it is missing, cannot be read, is too long, or is no text.
+    Raises RadioDataError: it is missing, cannot be read, is too long, or is not text.
     """
     try:
         data = read_input(file, MOST_DATA_BYTES)
@@ -70,22 +70,22 @@ def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam
 
 
 def content_lines(text: str) -> list[tuple[int, str]]:
-    """Number, from 1, and content of the lines that are neither empty nor a comment."""
+    """Line number, from 1, and content of all lines that are neither empty nor comments."""
     stripped = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
     return [(number, line) for number, line in stripped if line and not line.startswith(COMMENTS)]
 
 
 def split_cells(content: str, delimiter: str | None = ",") -> list[str]:
-    """The cells of a line, quoted or not, stripped; between white space without a delimiter."""
+    """The stripped cells of a line, quoted or not; split at white space if ``delimiter`` is ``None``."""
     if delimiter is None:
         return content.split()
     return [cell.strip() for cell in next(csv.reader([content], delimiter=delimiter, skipinitialspace=True))]
 
 
 def number(file: Path, line: int, text: str, what: str) -> float:
-    """A number, NaN and infinity included: ``Table.in_order`` leaves those out with a warning.
+    """A number; NaN and infinity are accepted, and ``Table.in_order`` drops their rows with a warning.
 
-    Raises RadioDataError: it is none.
+    Raises RadioDataError: it is not a number.
     """
     try:
         return float(text)
@@ -94,7 +94,7 @@ def number(file: Path, line: int, text: str, what: str) -> float:
 
 
 def is_number(text: str) -> bool:
-    """Whether a cell holds one."""
+    """Whether a cell holds a number."""
     try:
         float(text)
     except ValueError:
@@ -103,28 +103,28 @@ def is_number(text: str) -> bool:
 
 
 class Table(NamedTuple):
-    """Rows of numbers, shape (n, columns), and the number of the line of each, from 1, shape (n,)."""
+    """Rows of numbers, shape (n, columns), and the line number of each, from 1, shape (n,)."""
 
     file: Path
     values: FloatArray
     lines: IntArray
 
     def note(self, rows: BoolArray, what: str) -> str:
-        """A warning of some rows (n,), with the line of the first."""
+        """A warning about the rows of a mask (n,), with the line of the first."""
         first = int(self.lines[np.flatnonzero(rows)[0]])
         return f"{self.file.name}:{first}: {plural(int(rows.sum()), 'row')} {what}"
 
     def finite(self, warnings: list[str], columns: int | None = None) -> "Table":
-        """Rows that are finite in the first ``columns``, all if not given; the others are left out with a warning."""
+        """Rows that are finite in the first ``columns`` (default: all); the others are dropped with a warning."""
         finite = np.asarray(np.isfinite(self.values[:, :columns]).all(axis=1))
         if not finite.all():
             warnings.append(self.note(~finite, "not finite (the first here), left out"))
         return Table(self.file, self.values[finite], self.lines[finite])
 
     def in_order(self, warnings: list[str], columns: int | None = None) -> "Table":
-        """Finite rows by time (column 0) without repetitions; warns of rows that were out of order or doubled.
+        """Finite rows sorted by time (column 0) without duplicates; warns of unsorted and duplicate rows.
 
-        Rows that are the same in every column are one; rows of the same time that differ all stay, in their order.
+        Rows that are equal in every column count once; different rows of the same time all stay, in their order.
         """
         file, values, lines = self.finite(warnings, columns)
         back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
@@ -144,7 +144,7 @@ class Table(NamedTuple):
         return Table(file, values[keep], lines[keep])
 
     def with_unknown_ways(self, warnings: list[str]) -> "Table":
-        """Odometry by increments: rows with a time and no finite way keep the time, the way is NaN; with a warning."""
+        """Incremental odometry: a row with a time but other values not finite keeps its time, the rest becomes NaN."""
         unknown = np.isfinite(self.values[:, 0]) & ~np.isfinite(self.values).all(axis=1)
         if not unknown.any():
             return self
@@ -154,13 +154,13 @@ class Table(NamedTuple):
         return self._replace(values=values)
 
     def check_steps(self, what: str) -> None:
-        """Refuse odometry of fewer than three rows. Raises RadioDataError: there are fewer."""
+        """Raises RadioDataError: the odometry has fewer than three rows."""
         if len(self.values) < 3:
             raise RadioDataError(self.file, f"{len(self.values)} {what}: too few for a run")
 
 
 def tables_of(file: Path, rows: Iterable[tuple[str, int, list[float]]]) -> dict[str, Table]:
-    """A table for each kind of line, from rows of kind, number of the line and values."""
+    """A table for each kind of line, from rows of (kind, line number, values)."""
     found: dict[str, list[tuple[int, list[float]]]] = {}
     for kind, line, values in rows:
         found.setdefault(kind, []).append((line, values))
@@ -171,10 +171,10 @@ def tables_of(file: Path, rows: Iterable[tuple[str, int, list[float]]]) -> dict[
 
 
 def read_table(file: Path, names: tuple[str, ...], *, more: bool = False) -> Table:
-    """A table of numbers between white space or commas; a first line of words is a header.
+    """A table of numbers separated by white space or commas; a first line of words is a header.
 
-    ``more``: further columns are allowed, and left out. Raises RadioDataError: the file cannot be read, has no rows, or
-    a row is not ``names``.
+    ``more``: allow further columns and ignore them. Raises RadioDataError: the file cannot be read, has no rows, or a
+    row does not have the columns ``names``.
     """
     rows: list[tuple[str, int, list[float]]] = []
     for line, content in content_lines(read_text(file)):
@@ -192,11 +192,11 @@ def read_table(file: Path, names: tuple[str, ...], *, more: bool = False) -> Tab
 def tagged_row(
     file: Path, line: int, words: Sequence[str], layout: Mapping[str, tuple[str, ...]], names: dict[str, float]
 ) -> tuple[str, int, list[float]]:
-    """A line whose first word is its kind: kind, line, and the values of that kind's columns.
+    """Parse a line whose first word is its kind: (kind, line number, values of its columns).
 
-    ``layout``: columns by kind; those in parentheses may be missing. The column ``beacon`` is a name, all others are
-    numbers. ``names``: number of each name so far; new ones are added. Raises RadioDataError: the line is of no such
-    kind, or its values are not the columns.
+    ``layout``: columns by kind; those in parentheses are optional. The column ``beacon`` is a name, all others are
+    numbers. ``names``: number of each known name; new ones are added. Raises RadioDataError: unknown kind, or the
+    values do not fit the columns.
     """
     kind, *cells = words
     if kind not in layout:
@@ -219,12 +219,12 @@ def tagged_row(
 
 
 def needed_of(columns: Sequence[str]) -> int:
-    """How many columns of a layout have to be there."""
+    """Number of required columns of a layout."""
     return sum(not column.startswith("(") for column in columns)
 
 
 def within(times_s: FloatArray, odometry_s: FloatArray, what: str, warnings: list[str]) -> BoolArray:
-    """Which of the times lie in the span of the odometry's; warns of the others."""
+    """Mask of the times within the span of the odometry; warns of the others."""
     inside = (times_s >= odometry_s[0]) & (times_s <= odometry_s[-1])
     if not inside.all():
         warnings.append(f"{plural(int((~inside).sum()), what)} before the first or after the last odometry, left out")
@@ -232,7 +232,7 @@ def within(times_s: FloatArray, odometry_s: FloatArray, what: str, warnings: lis
 
 
 def long_pauses(times_s: FloatArray, least_s: float = GAP_S) -> IntArray:
-    """The rows after which nothing comes for longer than is usual."""
+    """Indices of the rows that are followed by an unusually long pause."""
     pauses = np.diff(times_s)
     if not (pauses > 0.0).any():
         return np.empty(0, dtype=np.int64)

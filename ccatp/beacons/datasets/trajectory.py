@@ -1,4 +1,4 @@
-"""Odometry and reference trajectory of a recorded run: gaps guessed, contradictions put right, the first pose."""
+"""Odometry and reference trajectory of a recorded run: filling gaps, correcting contradictions, the first pose."""
 
 import numpy as np
 import numpy.typing as npt
@@ -7,30 +7,30 @@ from ccatp.beacons.datasets.tables import long_pauses
 from ccatp.beacons.slam.recording import ReferencePath, Steps, antenna_path, dead_reckoned, running_total
 from ccatp.core import FloatArray
 
-BEFORE_S = 1.0  # over so long the speed before a gap is taken
-WINDOWS = 1000  # spans of the run by which speeds are compared with those before
-LOST_RAD = float(np.pi / np.sqrt(3.0))  # standard deviation of a heading that is anything: more cannot be unknown
-# Travel over which a course is taken from positions: well above the centimetres of GNSS and camera references.
+BEFORE_S = 1.0  # time before a gap over which the speed is measured
+WINDOWS = 1000  # samples of the run at which the speed is compared with the speed before
+LOST_RAD = float(np.pi / np.sqrt(3.0))  # standard deviation of a uniformly distributed heading: the largest possible
+# Travel between positions that give a course: well above the centimetres of error of GNSS and camera references.
 CHORD_M = 0.2
-LONGEST_WAY_M = 1e6  # longer ways are no vehicle's; they are not cut into chords
+LONGEST_WAY_M = 1e6  # longer paths are impossible for a vehicle and are not cut into chords
 AGREEMENT = 0.8  # length of the mean vector of (course - heading) above which the two differ by a constant
-LARGEST_SIDESLIP_RAD = 0.3  # a constant difference below it is the vehicle's own; above it is the reference's frame
-PIECE_S = 10.0  # long enough for a turn or two, short enough for odometry
+LARGEST_SIDESLIP_RAD = 0.3  # a smaller constant difference is sideslip; a larger one is an error of the reference
+PIECE_S = 10.0  # long enough for one or two turns, short enough for the drift of odometry
 PIECE_POINTS = 40
 LEAST_PIECES = 4
-MISFIT_RATIO = 0.5  # a turning factor is believed if it halves the misfit of a straight path
-FIRST_WAY_M = 2.0  # way whose shape gives the first heading if the reference has positions alone
+MISFIT_RATIO = 0.5  # a turning factor is accepted if it halves the misfit of a straight path
+FIRST_WAY_M = 2.0  # length of path that gives the first heading if the reference has only positions
 
 
 def amount_at(steps: Steps, amounts: FloatArray | float, times_s: FloatArray) -> FloatArray:
-    """What odometry adds up to at each time of amounts by step (n,); the shape of ``times_s``."""
+    """Running total of amounts per step (n,), interpolated at each time; the shape of ``times_s``."""
     total = running_total(np.broadcast_to(amounts, steps.distance_m.shape))
     found: FloatArray = np.interp(times_s, steps.times_s, total)
     return found
 
 
 def steps_of_speeds(t: FloatArray, speed: FloatArray, rate: FloatArray, side: FloatArray) -> Steps:
-    """Speeds, m/s and rad/s, that hold from their row to the next, of rows with one time the last; each shape (n,)."""
+    """Steps from speeds, m/s and rad/s, each shape (n,); a row holds until the next, and of equal times the last."""
     interval_s = np.diff(t)
     later = interval_s > 0.0
     distance, turn, lateral = ((column[:-1] * interval_s)[later] for column in (speed, rate, side))
@@ -38,11 +38,12 @@ def steps_of_speeds(t: FloatArray, speed: FloatArray, rate: FloatArray, side: Fl
 
 
 def bridged(steps: Steps) -> Steps:
-    """Steps without gaps: ways and turns that are NaN, or span a pause of the recording, are guessed.
+    """Steps without gaps: distances and turns that are NaN, or span a pause of the recording, are extrapolated.
 
-    A vehicle goes on as it did. How much so, and how far that is off, follows from the run: by the least-squares ratio,
-    over all spans as long as the gap, of what was travelled to the rate in the ``BEFORE_S`` before. If the heading is
-    lost by sigma, the mean of the way is shorter by exp(-sigma^2 / 2), and the rest of it is spread about that.
+    The extrapolation assumes that the vehicle keeps a share of its rate in the last ``BEFORE_S``. The share and its
+    error come from the run: a least-squares fit, over all spans as long as the gap, of the rate in the span to the rate
+    before it. With a heading error of sigma, the mean displacement is shorter by exp(-sigma^2 / 2); the rest of it
+    becomes variance.
     """
     interval_s = np.diff(steps.times_s)
     unknown = np.isnan(steps.distance_m + steps.turn_rad + steps.lateral_m)
@@ -81,7 +82,10 @@ def _rate_before(times_s: FloatArray, total: FloatArray, at_s: float) -> float:
 
 
 def _guessed(times_s: FloatArray, total: FloatArray, span_s: float) -> tuple[float, float]:
-    """Share and standard deviation of a span's amount, by the mean rate before it; over half the run at most."""
+    """Ratio of the rate in a span to the rate before it, and the standard deviation of the amount in the span.
+
+    Spans are at most half the run.
+    """
     whole_s = float(times_s[-1] - times_s[0])
     before_s, seen_s = min(BEFORE_S, 0.25 * whole_s), min(span_s, 0.5 * whole_s)
     t = np.linspace(times_s[0] + before_s, times_s[-1] - seen_s, WINDOWS)
@@ -93,7 +97,7 @@ def _guessed(times_s: FloatArray, total: FloatArray, span_s: float) -> tuple[flo
 
 
 def chords(truth: ReferencePath, steps: Steps) -> npt.NDArray[np.int64]:
-    """Rows of the truth some ``CHORD_M`` of travel apart, within the span of the odometry."""
+    """Rows of the truth about ``CHORD_M`` of travel apart, within the span of the odometry."""
     inside = (truth.times_s >= steps.times_s[0]) & (truth.times_s <= steps.times_s[-1])
     rows = np.flatnonzero(inside)
     way = running_total(np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows])))
@@ -104,10 +108,10 @@ def chords(truth: ReferencePath, steps: Steps) -> npt.NDArray[np.int64]:
 
 
 def checked_heading(truth: ReferencePath, steps: Steps, warnings: list[str]) -> ReferencePath:
-    """The truth with its heading along the course, turned with a warning if it is not.
+    """The truth with its heading along the course; if it is not, it is rotated with a warning.
 
-    Course and heading of a vehicle that rolls differ by its sideslip; a large constant difference means that the
-    reference counts the heading from elsewhere.
+    Course and heading of a moving vehicle differ by its sideslip; a large constant difference means that the reference
+    measures the heading from another direction.
     """
     if not np.isfinite(truth.heading_rad).any():
         return truth
@@ -117,7 +121,7 @@ def checked_heading(truth: ReferencePath, steps: Steps, warnings: list[str]) -> 
     course = np.arctan2(np.diff(truth.y_m[rows]), np.diff(truth.x_m[rows]))
     heading = 0.5 * (truth.heading_rad[rows[1:]] + truth.heading_rad[rows[:-1]])
     way = np.diff(amount_at(steps, steps.distance_m, truth.times_s[rows]))
-    rolls = np.abs(way) > 0.5 * CHORD_M  # by odometry too, so that it is no jump of the reference
+    rolls = np.abs(way) > 0.5 * CHORD_M  # by odometry too, to exclude jumps of the reference
     if rolls.sum() < 4:
         return truth
     vector = np.mean(np.exp(1j * (course - heading))[rolls] * np.sign(way[rolls]))
@@ -131,11 +135,11 @@ def checked_heading(truth: ReferencePath, steps: Steps, warnings: list[str]) -> 
 
 
 def turning_factor(truth: ReferencePath, steps: Steps) -> float | None:
-    """By what the turns of the odometry must be multiplied so that its path has the shape of the true one.
+    """The factor of the turns of the odometry for which its path has the shape of the true one.
 
-    The path is cut into pieces of some ``PIECE_S``; each is laid on the truth by its own rigid motion, and the factor
-    with the least median misfit is taken. Needs no heading of the truth. None where no factor is much better than not
-    turning at all, or the vehicle hardly moves.
+    The path is cut into pieces of ``PIECE_S``. Each is fitted to the truth by its own rigid motion, and the factor with
+    the least median misfit is taken. Needs no heading of the truth. None if no factor is much better than no turning at
+    all, or if the vehicle hardly moves.
     """
     start_s, end_s = max(steps.times_s[0], truth.times_s[0]), min(steps.times_s[-1], truth.times_s[-1])
     pieces = int((end_s - start_s) / PIECE_S)
@@ -169,10 +173,10 @@ def turning_factor(truth: ReferencePath, steps: Steps) -> float | None:
 
 
 def pose_of_truth(truth: ReferencePath | None, steps: Steps, warnings: list[str]) -> tuple[float, float, float]:
-    """The first pose: x_m, y_m, heading_rad at the first odometry time; the origin if there is no truth then.
+    """The first pose: x_m, y_m, heading_rad at the first odometry time; the origin without truth.
 
-    If the reference has positions alone, the heading is the one that lays the first metres of odometry on the first
-    metres of truth, by the least-squares rotation between the two.
+    If the reference has only positions, the heading is the least-squares rotation of the first metres of odometry onto
+    the first metres of truth.
     """
     if truth is None:
         warnings.append("no reference trajectory: the first pose is the origin, errors of the path stay unknown")
@@ -204,9 +208,10 @@ def at_antenna(
     steps: Steps, truth: ReferencePath | None, first_pose: tuple[float, float, float], antenna_m: tuple[float, float],
     warnings: list[str],
 ) -> tuple[Steps, ReferencePath | None, tuple[float, float, float]]:  # fmt: skip
-    """The same run as the way of an antenna that is so far ahead and to the left of the point that odometry is of.
+    """The run as the path of an antenna, mounted ahead and to the left of the odometry's reference point.
 
-    A turn w about that point moves the antenna across the lever by 2 sin(w / 2), seen in the middle of the turn.
+    A turn w about that point moves the antenna across its lever arm by 2 sin(w / 2) times the arm, in the frame at the
+    middle of the turn.
     """
     ahead_m, left_m = antenna_m
     swing = 2.0 * np.sin(0.5 * steps.turn_rad)
