@@ -1,7 +1,7 @@
 """The studies `cricket` and `mote-sizes` of motes that map themselves.
 
-`cricket`: figures 9 to 14 of Patil et al. again, and better ways beside them, at their cost. `mote-sizes`: what a batch
-map of sparse ranges costs, against the number of motes.
+`cricket`: reproduces figures 9 to 14 of Patil et al. and compares better methods. `mote-sizes`: computing time of a
+batch map from sparse ranges, against the number of motes.
 """
 
 import time
@@ -23,20 +23,20 @@ from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, S
 from ccatp.studies.mote_runs import look_ahead, percentiles, run_batch, run_filter, simulate_field
 from ccatp.studies.results import LIMIT, Measure, Row, band, colour, draw_ranges, plot, write_analysis
 
-UPDATES = 300  # of figures 11 and 12 as we read them
-SHOWN = 30  # updates within which figure 14 comes down
-_ENDLESS_M = 1e-6  # a target that is never reached: the figures go on
+UPDATES = 300  # in figures 11 and 12, as we read them
+SHOWN = 30  # updates after which figure 14 has converged
+_ENDLESS_M = 1e-6  # a target that is never reached, so that all updates are made
 _PLAIN = {
     "cricket.phase2.pools": False,
     "cricket.phase2.linearisations": 1,
     "cricket.phase2.gate_probability": 1.0 - 1e-15,
 }
 _PRINTED = {"cricket.phase2.prior": "printed"}
-_LATE = {"cricket.sim.latency_s": 0.0003}  # 10 cm: a pulse that is detected a few periods late
+_LATE = {"cricket.sim.latency_s": 0.0003}  # 10 cm: the pulse is detected a few periods late
 
 
 class Case(NamedTuple):
-    """A row of the study; ``method`` is ``ekf`` or ``batch``, ``keys`` stand over ``configs/cricket.toml``."""
+    """A row of the study; ``method`` is ``ekf`` or ``batch``, ``keys`` override ``configs/cricket.toml``."""
 
     figure: str
     method: str
@@ -112,7 +112,7 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         "rms_of_all_m": total,
         "phase1_rms_m": float(np.median(phase1_m)) if phase1_m else None,
         "rms_at_30_m": shown_m,
-        # The paper's error is of a coordinate, root(mean e^2) over all of them; ours of a place.
+        # The error of the paper is root(mean e^2) over all coordinates; ours is that of positions.
         "coordinate_rms_at_30_m": None if shown_m is None else float(shown_m / np.sqrt(2.0)),
         "expected_rms_m": float(np.median([run["expected_rms_m"] for run in runs])),
         "bound_m": bound_m,
@@ -145,7 +145,7 @@ _MAPS = (("zigzag-printed", "figures 9, 10: five pairs"), ("all-printed", "figur
 
 
 def draw(cells: Sequence[CellResult], out: Path) -> None:
-    """Traces (figures 11, 12, 14), clouds of maps (9, 10, 13), all ways beside each other."""
+    """Errors against updates (figures 11, 12, 14), maps of many runs (9, 10, 13), comparison of all methods."""
     found = {str(cell.factors["case"]): cell for cell in cells}
     for stem, names, title, goal_m in _TRACES:
         if shown := [name for name in names if name in found]:
@@ -203,7 +203,7 @@ STUDY = Study(
 # -- mote-sizes -------------------------------------------------------------------------------------------------------
 
 SIZES = (30, 60, 120, 250, 500, 1000)
-NEIGHBOURS = 13.0  # of a mote, on the average, beside those at the rim
+NEIGHBOURS = 13.0  # mean number for a mote that is not at the rim
 REACH_M, SIGMA_M = 5.5, 0.02 / 3.0
 _ROBUST = 4.0
 
@@ -223,7 +223,7 @@ def run_sizes(cfg: Config, out: Path) -> dict[str, Any]:
 
 
 def drawn_network(size: int, rng: np.random.Generator) -> tuple[RangeNetwork, FloatArray]:
-    """A square field with ranges between motes that are near each other: its largest connected part, and the truth."""
+    """A random square field with ranges between near motes: its largest connected part, and the true positions."""
     side_m = REACH_M * np.sqrt(np.pi * size / NEIGHBOURS)
     places = rng.uniform(0.0, side_m, (size, 2))
     distances = np.linalg.norm(places[:, None] - places[None], axis=2)

@@ -1,6 +1,6 @@
-"""The study `mote-navigation`: motes map themselves, then guide a robot along its route; error against map.
+"""The study `mote-navigation`: motes map themselves, then a robot localizes by them along its route.
 
-Each job is a whole mission among beacons in one process: the daemon's own mission and danger rules against the sim.
+Each job simulates a whole mission in one process, with the mission and danger rules of the daemon.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ from ccatp.survey.events import DONE
 
 @dataclass(slots=True)
 class BeaconSilResult:
-    """A mission: ``summary`` as ``summary.json``, rows of ``beacon_track`` and ``beacon_truth``; one entry a frame."""
+    """A mission: ``summary`` as in ``summary.json``; a row of ``beacon_track`` and ``beacon_truth`` for each frame."""
 
     summary: dict[str, Any] = field(default_factory=dict)
     states: list[str] = field(default_factory=list)
@@ -60,7 +60,7 @@ class BeaconSilResult:
 
 
 class BeaconSilWorld:
-    """Robot, danger rules and mission, frame by frame."""
+    """Simulated robot, danger rules and mission, stepped frame by frame."""
 
     def __init__(self, cfg: RadioConfig) -> None:
         self._cfg = cfg
@@ -77,17 +77,17 @@ class BeaconSilWorld:
 
     @property
     def is_over(self) -> bool:
-        """The mission has ended, or would wait for an operator: that ends it in lockstep."""
+        """Whether the mission has ended, or would wait for an operator, which a simulation does not have."""
         return self.mission.state.mode is DONE or self.mission.state.is_faulted
 
     def frame(self) -> None:
-        """The newest frame: judged, decided, and driven on from unless that was the end."""
+        """Process the newest frame, and advance the simulation unless the mission is over."""
         line = self.robot.delivered_line.rstrip()
         sensors = decode_from_robot(line)
         if not isinstance(sensors, Sensors):
             raise TypeError(f"not a sensors frame: {line[:80]!r}")
         extras = decode_beacon_frame(line)
-        # The decision in a frame goes by the verdict on the one before.
+        # The decision in a frame uses the verdict on the previous frame.
         in_force, verdict = self._verdict, self.danger.step(sensors, extras, self._estimate)
         self._verdict = verdict
         before = len(self.mission.arrivals)
@@ -135,19 +135,19 @@ class BeaconSilWorld:
 
 
 def rehearse_beacons(cfg: RadioConfig) -> BeaconSilResult:
-    """A mission from its first frame to its end, in virtual time; a function of configuration and seed."""
+    """Simulate a mission in virtual time; the result depends only on configuration and seed."""
     world = BeaconSilWorld(cfg)
     while not world.is_over:
         world.frame()
     return world.result()
 
 
-SECOND = 10  # frames; errors are compared once in so many
+SECOND = 10  # frames between two comparisons of errors
 _STATES = 3  # x, y, heading
 
 
 def run_job(job: Job) -> JobOutcome:
-    """One mission: its figures, and errors each second from the end of mapping on."""
+    """Run one mission: its statistics, and its errors each second after the end of mapping."""
     found = rehearse_beacons(job.cfg)
     summary = found.summary
     values = {
@@ -178,7 +178,7 @@ def seconds_of(track: PoseTrack, truth: PoseTruth, begin_s: float) -> dict[str, 
 
 
 def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """The missions together: NEES at each second over all of them, against the band of its chi-squared sum."""
+    """Combine the missions: NEES at each second over all of them, with the band of its chi-squared sum."""
     runs = [outcome.values for outcome in outcomes]
     length = min(len(outcome.arrays["nees"]) for outcome in outcomes)
     squares, errors, sigmas = (
@@ -205,7 +205,7 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
 
 
 def draw(cells: Sequence[CellResult], out: Path) -> None:
-    """Figure ``mote_navigation``: errors beside what is expected, and NEES in its band, over time."""
+    """Figure ``mote_navigation``: actual and expected errors, and NEES with its band, over time."""
     cell = cells[0]
     seconds = np.arange(len(cell.arrays["nees"]))
     true_mm, expected_mm = 1e3 * cell.arrays["error_m"], 1e3 * cell.arrays["sigma_m"]

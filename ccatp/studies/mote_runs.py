@@ -29,14 +29,14 @@ from ccatp.report.beacon_plots import MapPicture, Traces
 from ccatp.sim.motes import MoteField, MotePulse, true_motes
 
 _LAYOUT, _FIELD, _READINGS = 0, 1, 2  # streams of random numbers of one seed
-_GENERIC = 0  # seed of the random places of rank and fold-over: they must not depend on the run
-_KNOWN_M2 = 1e-14  # variance of a coordinate that is known
-_LINED = 100  # motes up to which the measured pairs are drawn
+_GENERIC = 0  # seed of the random positions for rank and fold-over, which must not depend on the run
+_KNOWN_M2 = 1e-14  # variance below which a coordinate is known
+_LINED = 100  # largest number of motes for which the figure shows the measured pairs
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedField:
-    """One simulated field of motes: the truth, and all ranges that phases 1 and 2 are given."""
+    """One simulated field of motes: the truth, and all ranges for phases 1 and 2."""
 
     plan: MotePlan
     true_m: FloatArray  # places of all motes, shape (n, d)
@@ -44,13 +44,13 @@ class SimulatedField:
     second: tuple[MoteRange, ...]  # of phase 2, in its order
 
     def network(self, *, with_second: bool = False, with_shapes: bool = False) -> RangeNetwork:
-        """The graph of phase 1, with phase 2 and the shapes of the stands where asked (raises MappingError: no map)."""
+        """The graph of phase 1, optionally with phase 2 and known stands. Raises MappingError: they give no map."""
         rows = [*self.first, *(self.second if with_second else ())]
         return build_network(rows, self.plan.dimension, self.plan.names, self.plan.bodies if with_shapes else ())
 
 
 def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
-    """Draw the errors of one field and all that its motes receive (raises MappingError: no pair of phase 2 ranges)."""
+    """Draw the errors and all ranges of one field. Raises MappingError: no pair of phase 2 has a range."""
     motes = true_motes(cfg, np.random.default_rng((seed, _LAYOUT)))
     plan = network_plan(cfg) if cfg.layout == "networks" else loose_plan(cfg, motes.names)
     field = MoteField(cfg, motes, np.random.default_rng((seed, _FIELD)))
@@ -70,36 +70,36 @@ def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
 
 @dataclass(frozen=True, slots=True)
 class MoteRun:
-    """One self-mapping: the motes that were mapped, and the truth in the same frame."""
+    """One self-mapping: the estimated and the true positions in the same frame."""
 
     names: tuple[str, ...]
     positions_m: FloatArray
     covariance_m2: FloatArray
     true_m: FloatArray
     phase1_rms_m: float | None  # error of phase 1; None where it could not place all motes
-    trace_m: FloatArray  # error after each update, phase 1 first; of the batch just both; aligned where is_aligned
+    trace_m: FloatArray  # error after phase 1 and after each update; of the batch after phase 1 and at the end
     expected_trace_m: FloatArray
-    is_aligned: bool  # whether the frame was free: errors are those after the best rigid motion
+    is_aligned: bool  # whether the frame was free: all errors are those after the best rigid motion
     iterations: int
     offset_m: float
     scale: float
     nis: FloatArray = field(default_factory=lambda: np.zeros(0))
-    doubtful: tuple[int, ...] = ()  # rows of motes whose mirror image fits as well, or that hang on too few ranges
+    doubtful: tuple[int, ...] = ()  # rows of motes whose mirror image fits as well, or that have too few ranges
     whole: tuple[tuple[str, ...], FloatArray, FloatArray] | None = None  # all motes of the stands, if there are others
 
     @property
     def rms_m(self) -> float:
-        """Error at the end."""
+        """Final error."""
         return float(self.trace_m[-1])
 
     @property
     def expected_rms_m(self) -> float:
-        """The same as the map's covariance has it."""
+        """Final error that the covariance of the map predicts."""
         return float(self.expected_trace_m[-1])
 
     @property
     def nees(self) -> float | None:
-        """Of all places by degree of freedom, known coordinates left out; None where the frame was free."""
+        """NEES per degree of freedom of all unknown coordinates; None if the frame was free."""
         if self.is_aligned:
             return None
         values, vectors = np.linalg.eigh(self.covariance_m2)
@@ -110,7 +110,7 @@ class MoteRun:
 
 @dataclass(frozen=True, slots=True)
 class MoteOutlook:
-    """What the ranges determine; the Cramér-Rao bound at the true places, None where something stays free."""
+    """What the ranges determine, and the Cramér-Rao bound at the true positions, None if a direction is free."""
 
     freedom: Freedom
     folds: FoldOver
@@ -118,9 +118,9 @@ class MoteOutlook:
 
 
 def first_map(cfg: CricketConfig, field: SimulatedField, draws: int = 0) -> FirstMap:
-    """Phase 1: trilateration of stands, its bias and covariance by so many draws; the batch where there is no plan.
+    """Phase 1: trilateration of the stands, with bias and covariance from ``draws``; without stands the batch map.
 
-    Raises MappingError: a step that cannot be made.
+    Raises MappingError: a step fails.
     """
     plan, network = field.plan, field.network()
     if plan.bodies:
@@ -167,10 +167,10 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
 
 
 def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | None = None) -> MoteRun:
-    """The batch over all ranges of both phases; its error after the best rigid motion.
+    """The batch map from all ranges of both phases, with its error after the best rigid motion.
 
-    ``outlook`` of the same graph has the sets of motes that may be mirrored. Raises MappingError: the ranges make no
-    map.
+    ``outlook``: of the same graph; it has the sets of motes that may be mirrored. Raises MappingError: the ranges give
+    no map.
     """
     plan = field.plan
     network = batch_network(cfg, field)
@@ -219,15 +219,15 @@ def _block(covariance_m2: FloatArray, motes: list[int], dimension: int) -> Float
 
 
 def batch_network(cfg: CricketConfig, field: SimulatedField) -> RangeNetwork:
-    """The graph that the batch uses: ranges of phases 1 and 2 and shapes of the stands, as the configuration says."""
+    """The graph for the batch; the configuration selects the ranges of phase 2 and the shapes of the stands."""
     return field.network(with_second=cfg.batch.uses_phase2, with_shapes=cfg.batch.uses_shapes)
 
 
 def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: int | None = None) -> MoteOutlook:
-    """Rank, folds and bound of what a method, ``ekf`` or ``batch``, is given, up to so many ranges of phase 2.
+    """Rank, folds and bound for the data of a method, ``ekf`` or ``batch``, up to ``updates`` ranges of phase 2.
 
-    For the filter, rank and folds are those of phase 2 alone, as the stands see each other; its bound takes in what
-    phase 1 measured too, unless the printed prior throws that away.
+    For the filter, rank and folds are those of phase 2 alone. Its bound includes the ranges of phase 1, unless the
+    printed prior discards their information.
     """
     plan = field.plan
     rng = np.random.default_rng(_GENERIC)
@@ -252,10 +252,10 @@ def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: 
 
 
 def _in_field(field: SimulatedField, found: MoteMap, *, has_shapes: bool) -> tuple[FloatArray, FloatArray]:
-    """The map in the field's frame, as far as the operator knows it.
+    """The map in the frame of the field, as far as an operator knows this frame.
 
-    Without shapes, ranges do not tell a map from its mirror image: the first stand is on the right of the axis from A
-    to B, as in phase 1.
+    Without shapes, ranges cannot distinguish a map from its mirror image. Then the first stand is to the right of the
+    axis from A to B, as in phase 1.
     """
     plan, places_m, covariance_m2 = field.plan, found.positions_m, found.covariance_m2
     if not plan.anchors:
@@ -294,13 +294,13 @@ class MoteCampaign(NamedTuple):
 def run_campaign(
     cfg: CricketConfig, method: str, seeds: Sequence[int], on_done: Callable[[int], None] = lambda _: None
 ) -> MoteCampaign:
-    """Map the motes once for each seed, by ``ekf`` or ``batch`` (raises MappingError: a field has no map)."""
+    """Map the motes once for each seed, by ``ekf`` or ``batch``. Raises MappingError: a field gives no map."""
     field = simulate_field(cfg, seeds[0])
     outlook = look_ahead(cfg, field, method)
     runs = []
     for done, seed in enumerate(seeds, start=1):
         drawn = field if seed == seeds[0] else simulate_field(cfg, seed)
-        # Drawn layouts differ from seed to seed, and so do their folds.
+        # Random layouts differ between seeds, and so do their folds.
         known = outlook if cfg.layout != "random" or seed == seeds[0] else look_ahead(cfg, drawn, method)
         runs.append(run_filter(cfg, drawn) if method == "ekf" else run_batch(cfg, drawn, known))
         on_done(done)
@@ -342,7 +342,7 @@ def campaign_data(campaign: MoteCampaign) -> dict[str, Any]:
 
 
 def sure_rms_m(run: MoteRun) -> float:
-    """Error of the motes that are not in doubt, in the frame of the run; not a number where there are too few."""
+    """Error of the motes that are not doubtful, in the frame of the run; NaN if there are too few."""
     sure = [row for row in range(len(run.names)) if row not in run.doubtful]
     found, true = run.positions_m[sure], run.true_m[sure]
     if not run.is_aligned:
@@ -356,18 +356,18 @@ def percentiles(values: Sequence[float]) -> dict[str, float]:
 
 
 def pictured(campaign: MoteCampaign, seed: int) -> tuple[MapPicture, Traces | None]:
-    """The map of the first run, and of the filter the errors against updates."""
+    """The map of the first run and, for the filter, the errors against updates."""
     run = campaign.runs[0]
     title = f"{campaign.method}, {len(run.names)} motes, seed {seed}, error {1e3 * run.rms_m:.3g} mm"
     positions_m, covariance_m2 = run.positions_m, run.covariance_m2
-    if run.is_aligned:  # its frame is its own: moved onto the truth, for the eye
+    if run.is_aligned:  # its frame is arbitrary: move it onto the truth for display
         motion = best_motion(run.positions_m, run.true_m, mirrors=True)
         positions_m, covariance_m2 = motion.moved(positions_m), motion.turned_map(covariance_m2)
     pairs = np.array(_pairs(campaign, run), dtype=np.intp).reshape(-1, 2)
     picture = MapPicture(run.names, positions_m, covariance_m2, run.true_m, pairs, run.doubtful, title)
     if campaign.method != "ekf":
         return picture, None
-    # A run that ended early stays where it was.
+    # A run that ended early keeps its last error.
     longest = max(len(one.trace_m) for one in campaign.runs)
     errors, expected = (
         np.array([np.pad(trace, (0, longest - len(trace)), mode="edge") for trace in traces])
@@ -379,7 +379,7 @@ def pictured(campaign: MoteCampaign, seed: int) -> tuple[MapPicture, Traces | No
 
 
 def _pairs(campaign: MoteCampaign, run: MoteRun) -> list[tuple[int, int]]:
-    """Pairs of motes of the map that ranged, in phase 2 for the filter, in phase 1 for the batch."""
+    """Pairs of mapped motes with ranges, in phase 2 for the filter, in phase 1 for the batch."""
     field = campaign.field
     if len(run.names) > _LINED:
         return []

@@ -1,9 +1,9 @@
-"""The posterior Cramér-Rao bound of a vehicle among radios: the least error of any estimator of their places.
+"""The posterior Cramér-Rao bound of a vehicle among radios: the least error of any estimator of their positions.
 
-For a model with Gaussian noise, the covariance of the extended Kalman filter that is linearised at the truth is the
-bound's recursion (Taylor 1979; Tichavsky, Muravchik and Nehorai 1998). States: pose, places of the static radios, place
-and velocity of the moving one, and the static shadowing at each place where radios were received. Reflected rays are
-left out: in a world that has some, this bounds the error where they do no harm.
+For Gaussian noise, the bound is the covariance of an extended Kalman filter that is linearised at the truth (Taylor
+1979; Tichavsky, Muravchik and Nehorai 1998). States: pose, positions of the static radios, position and velocity of the
+moving one, and the static shadowing at each place of reception. Reflected rays are not modelled: in a world with
+reflections the bound assumes that they cause no error.
 """
 
 from collections.abc import Sequence
@@ -18,14 +18,14 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import BlockId, EkfSlam, columns_of
 
-_ANYWHERE = 10.0  # times the room: standard deviation of a place of which nothing is known
-_MOST_PLACES = 100  # with shadowing: the state has a value for each place and radio
+_ANYWHERE = 10.0  # times the size of the room: standard deviation of an unknown position
+_MOST_PLACES = 100  # limit with shadowing, because the state has a value for each place and radio
 _LEVEL_PER_LOG = 10.0 / log(10.0)
 _TARGET, _FIELD = "target", "shadowing"
 
 
 class TrueStep(NamedTuple):
-    """A step of a run as it was: x_m, y_m, heading_rad at its end, its odometry, and where the moving radio was."""
+    """A true step: x_m, y_m, heading_rad at its end, its odometry, and the position of the moving radio."""
 
     pose: tuple[float, float, float]
     odometry: Odometry
@@ -33,7 +33,7 @@ class TrueStep(NamedTuple):
 
 
 class RadioBound(NamedTuple):
-    """Root mean square errors that no estimator falls below, m."""
+    """Lower bounds of root mean square errors, m."""
 
     beacons_m: float  # of the static radios at the end
     target_m: float | None  # of the moving one, over the last steps; None without one
@@ -42,10 +42,10 @@ class RadioBound(NamedTuple):
 def radio_bound(
     cfg: RadioConfig, steps: Sequence[TrueStep], beacons_m: Sequence[tuple[float, float]], settled_share: float
 ) -> RadioBound | None:
-    """The bound along a way that was driven.
+    """The bound along a driven path.
 
-    ``settled_share``: of the run, before the moving radio's error counts. None where shadowing would have too many
-    states.
+    ``settled_share``: first part of the run, for which the error of the moving radio is not counted. None if shadowing
+    would need too many states.
     """
     every, target_every = cfg.observation.every_steps, cfg.observation.target_every_steps
     places_m = np.array([step.pose[:2] for step in steps[every - 1 :: every]])
@@ -103,7 +103,7 @@ def _learn(
     engine: EkfSlam, cfg: RadioConfig, R: FloatArray, pose: tuple[float, float, float], place_m: tuple[float, float],
     block: BlockId, field: tuple[int, int] | None,
 ) -> None:  # fmt: skip
-    """Condition on level and bearing of a radio. ``field``: which radio's shadowing, and at which place."""
+    """Update with level and bearing of a radio. ``field``: its shadowing state, by radio and place."""
     dx, dy = place_m[0] - pose[0], place_m[1] - pose[1]
     r2 = dx * dx + dy * dy
     slope = _LEVEL_PER_LOG * cfg.path_loss.exponent / r2
@@ -124,7 +124,7 @@ def _variance(engine: EkfSlam, block: BlockId) -> float:
 
 
 def _noise(cfg: RadioConfig) -> FloatArray:
-    """Variances of level and bearing of a scan that is used for all that it holds, shape (2,)."""
+    """Variances of level and bearing if all information of a scan is used, shape (2,)."""
     radio, step_rad = cfg.sim.radio, tau / cfg.scan.readings
     level_db2 = radio.white_sigma_db**2
     if radio.scan == "drawn":

@@ -1,13 +1,14 @@
 """The studies of radio beacons.
 
-`radio-signals`: levels against range and bearings of the reflector, beside Hevrdejs and Knoll 2017, packet by packet.
+`radio-signals`: level against range, and bearings of the reflector, compared with Hevrdejs and Knoll 2017; every packet
+is simulated.
 
-`radio-cases`: the three experimental cases of the same slides. They print the errors of three drives in a laboratory
-and nothing of the drives. Ours are three paths in the same room, among the same radios with 5 dB of static shadowing
-and reflected rays, read through the turning reflector.
+`radio-cases`: the three experimental cases of the same slides. These print the errors of three drives in a laboratory,
+but not the drives. Ours are three paths in the same room, among the same radios, with 5 dB of static shadowing and
+reflected rays, measured with the turning reflector.
 
-`radio-follow`: a moving radio is mapped and followed, side by side with Auth and Hovey 2018. `radio-slam`: EKF-SLAM
-among four ZigBee radios, in two rooms, with slip and with shadowing.
+`radio-follow`: a moving radio is mapped and followed, compared with Auth and Hovey 2018. `radio-slam`: EKF-SLAM among
+four ZigBee radios, in two rooms, with slip and with shadowing.
 """
 
 from collections import defaultdict
@@ -38,19 +39,19 @@ from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, S
 from ccatp.studies.radio_bound import RadioBound, TrueStep, radio_bound
 from ccatp.studies.results import LIMIT, Measure, Row, band, chi_square_band, colour, draw_ranges, grouped, plot
 
-# -- a run with the truth beside the estimates -------------------------------------------------------------------------
+# -- a run with truth and estimates ------------------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
 class RadioRun:
-    """What a run leaves; errors are estimate minus truth.
+    """The result of a run; errors are estimate minus truth.
 
-    ``steps``: x, y and heading, the same as estimated, x and y by dead reckoning alone, x and y of the moving radio and
-    where it is believed (NaN where there is none), and the distance to what stands in the room; shape (k, 13).
+    ``steps``: true x, y and heading, the estimates of these, x and y by dead reckoning, true and estimated x and y of
+    the moving radio (NaN without one), and the distance to the obstacles in the room; shape (k, 13).
     """
 
     steps: FloatArray
-    # By name, from the first estimate on: distance of estimate and truth, and NEES with 2 degrees of freedom.
+    # By name, from the first estimate on: error of the position, and NEES with 2 degrees of freedom.
     beacon_errors_m: Mapping[str, list[float]]
     beacon_nees: Mapping[str, list[float]]
     nis: list[tuple[float, int]]  # of each reading, and its degrees of freedom
@@ -60,7 +61,7 @@ class RadioRun:
 
 
 def run_radio(cfg: RadioConfig) -> RadioRun:
-    """A whole run; a function of the configuration and its seed."""
+    """Simulate a run; the result depends only on the configuration and its seed."""
     world, navigator, pilot = RadioWorld(cfg), RadioNavigator(cfg), BeaconPilot(cfg)
     drive, observation, slam, target_name = HALT, cfg.observation, navigator.slam, cfg.follow.target
     truths: dict[str, tuple[float, float]] = {}
@@ -88,7 +89,7 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
         steps.append((*world.pose, *slam.pose, *navigator.reckoned_m, *target_m, *believed, world.clearance_m))
     places = {str(name): (estimate.mean, np.array(truths[str(name)])) for name, estimate in slam.beacons.items()}
     bound = radio_bound(cfg, driven, list(world.beacons_m.values()), SETTLED_SHARE)
-    # Radios whose readings still wait are not on the map.
+    # Radios without enough readings to be placed are not on the map.
     placed = [name for name in world.beacons_m if name in slam.engine]
     mean, covariance = slam.joint(placed)
     truth = np.concatenate([world.pose, *(world.beacons_m[name] for name in placed)])
@@ -103,7 +104,7 @@ def _nees(error: FloatArray, covariance: FloatArray) -> float:
     return float(error @ np.linalg.solve(covariance, error))
 
 
-SETTLED_SHARE = 0.3  # of a run: errors over time are counted after it, when radios have been found
+SETTLED_SHARE = 0.3  # of a run; errors over time are evaluated after it, when the radios are on the map
 _CURVE_EVERY = 10  # steps of 0.1 s between the points of a curve
 _POINT_S = 1.0
 _HIT = float(chdtri(2, 0.1))
@@ -117,7 +118,7 @@ _MEANS = ("pose_m", "reckoned_m", "pose_aligned_m", "reckoned_aligned_m", "headi
 
 
 def run_job(job: Job) -> JobOutcome:
-    """Figures of a run, and its errors over time."""
+    """Run one job: its statistics and its errors over time."""
     run, target = run_radio(job.cfg), job.cfg.follow.target
     truth, estimates, reckoned, targets, believed = (run.steps[:, k : k + 2].copy() for k in (0, 3, 6, 8, 10))
     motion, reckoned_motion = best_motion(estimates, truth), best_motion(reckoned, truth)
@@ -158,7 +159,7 @@ def run_job(job: Job) -> JobOutcome:
 
 
 def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """The runs of a cell pooled: errors, coverage, consistency with the 95 % bands of their chi-squared sums."""
+    """Pool the runs of a cell: errors, coverage, and consistency with the 95 % bands of the chi-squared sums."""
     runs = [outcome.values for outcome in outcomes]
 
     def each(key: str) -> list[Any]:
@@ -195,7 +196,7 @@ def _spread(values: Sequence[float]) -> dict[str, float]:
 
 
 def _band(freedom: float) -> str:
-    """Where the mean of so many normalised squares lies with 95 % probability."""
+    """The 95 % interval of the mean of ``freedom`` normalised squares."""
     if freedom < 1.0:
         return "-"
     low, high = chi_square_band(freedom)
@@ -203,7 +204,7 @@ def _band(freedom: float) -> str:
 
 
 def _curve(errors_m: Sequence[Sequence[float]], steps: int) -> FloatArray:
-    """Mean over series that end with the run, at every tenth of so many steps; NaN where none has begun."""
+    """Mean over series that end with the run, at every tenth of ``steps``; NaN before the first series begins."""
     rows = np.full((len(errors_m), steps), np.nan)
     for row, errors in zip(rows, errors_m, strict=True):
         row[steps - len(errors) :] = errors
@@ -256,7 +257,7 @@ CONDITIONS: dict[str, dict[str, object]] = {
 
 
 def run_signals(job: Job) -> JobOutcome:
-    """Turns of the reflector at one place, with shadowing and reflections of their own for each seed."""
+    """Turns of the reflector at one place; shadowing and reflections are drawn for each seed."""
     cfg, place = job.cfg, str(job.factors["place"])
     at_m = CORNERS_M.get(place) or (ROBOT.x_m + float(place.removesuffix(" m")), ROBOT.y_m)
     results = _turns(cfg, at_m)
@@ -294,7 +295,7 @@ def combine_signals(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
 
 
 def printed_signals(factors: Factors) -> Mapping[str, Any]:
-    """Of a place, in 2017."""
+    """The values that 2017 prints for a place."""
     place = str(factors["place"])
     if place in CORNERS_M:
         return {"bearing_error_deg": PRINTED_DEG[place]}
@@ -304,7 +305,7 @@ def printed_signals(factors: Factors) -> Mapping[str, Any]:
 
 
 def draw_signals(results: Sequence[CellResult], out: Path) -> None:
-    """Figure ``radio_signals``: level over range and error of the bearing by beacon: printed, model, ours."""
+    """Figure ``radio_signals``: level against range, and bearing error by beacon: printed, model, ours."""
     at, ranges = np.arange(len(CORNERS_M)), np.array(RANGES_M)
     mark: dict[str, Any] = {"color": LIMIT, "markersize": 8, "markeredgewidth": 2, "label": "2017"}
     with plot(out / "radio_signals", 10.0, 4.0, 1, 2) as (left, right):
@@ -338,7 +339,7 @@ def _turns(cfg: RadioConfig, sender_m: tuple[float, float]) -> list[Reading]:
     scan = ReflectorScan(cfg.scan)
     headings = np.random.default_rng([cfg.run.seed, 2]).uniform(-pi, pi, TURNS) / cfg.scan.readings
     found = []
-    for offset_rad in headings.tolist():  # the robot never stands quite straight: steps and beacon are not in line
+    for offset_rad in headings.tolist():  # random headings, so that the beacon is not aligned with a reflector step
         levels_dbm = radio.scan(ROBOT._replace(heading_rad=offset_rad), sender_m)
         for result in scan.results(0.0, packets_of(RadioScan(0.0, scan.step_rad, {"radio": levels_dbm}))):
             straight = None if result.bearing_rad is None else result.bearing_rad + offset_rad
@@ -412,7 +413,7 @@ RADIO_CASES = RadioStudy(
 
 # -- radio-follow -----------------------------------------------------------------------------------------------------
 
-# Figures 3.2 to 3.5 of 2018, as its text sums them up.
+# Figures 3.2 to 3.5 of 2018, as summarized in its text.
 FOLLOW_PRINTED: dict[str, dict[str, str]] = {
     "ideal": {"target_m": "0.20", "beacons_m": "0.20 to 0.30"},
     "restrictive": {"target_m": "about 0.35", "beacons_m": "0.20 to 0.30"},
@@ -474,7 +475,7 @@ EVERY = (30, 1)
 
 
 def room_of(size_m: float, margin_m: float) -> dict[str, object]:
-    """Overrides for a square room: beacons in its corners, a square loop that keeps so far from the walls."""
+    """Overrides for a square room: beacons in its corners, and a square loop ``margin_m`` from the walls."""
     far_m = size_m - margin_m
     corners = {"beacon2": (0.0, size_m), "beacon3": (size_m, 0.0), "beacon4": (size_m, size_m)}
     return {
@@ -491,7 +492,7 @@ ROOMS = {"3 m": room_of(3.0, 0.8), "5 m": room_of(5.0, 0.8)}
 
 
 def slam_cells() -> Sequence[Cell]:
-    """Rooms times conditions at every 30 steps; in the small room at every step, too."""
+    """All rooms and conditions with readings every 30 steps; the small room also with readings at every step."""
     return [
         Cell(
             {"room": room, "condition": condition, "every": every},

@@ -31,7 +31,7 @@ from ccatp.studies.replay import replay
 
 WORLD, MAP, BASE_LINK, IMU_LINK, PUCK_LINK = "world", "map", "base_link", "imu_link", "puck_link"
 WHEELS = ["wheel_right", "wheel_left"]
-# Variance along and about axes in which nothing is measured, as drivers of wheeled robots have it.
+# Variance for axes that are not measured; drivers of wheeled robots use the same convention.
 NOT_MEASURED = 1e6
 _NO_TIME = QosTime(0, 0)
 _LATCHED = Qos(
@@ -44,16 +44,16 @@ _NS = 1_000_000_000
 _Vector = ros.geometry_msgs__msg__Vector3
 
 
-# By the wheels: speed and rate (m/s, rad/s), and the variances of both, slip included.
+# From the wheels: speed and turn rate (m/s, rad/s), and their variances including slip.
 _Motion = tuple[float, float, float, float]
 _UNKNOWN: _Motion = nan, nan, NOT_MEASURED, NOT_MEASURED
 
 
 def write_bag(folder: Path, recording: Recording, cfg: Config, mirror: Mirror) -> dict[str, int]:
-    """Write a new bag in MCAP, and return how many messages each topic has.
+    """Write a new bag in MCAP, and return the number of messages of each topic.
 
-    Poses are those that were recorded; a replay computes their covariances again. Defects are added to the warnings of
-    the recording. OSError: the folder cannot be written.
+    Poses are the recorded ones; a replay recomputes their covariances. Defects are added to the warnings of the
+    recording. Raises OSError: the folder cannot be written.
     """
     motions: dict[int, _Motion] = {}
     trace = replay(cfg, mirror, _with_motions(in_order(recording.messages()), cfg, motions)).trace
@@ -73,7 +73,7 @@ def write_bag(folder: Path, recording: Recording, cfg: Config, mirror: Mirror) -
 
 
 def _with_motions(events: Iterable[Event], cfg: Config, motions: dict[int, _Motion]) -> Iterator[Event]:
-    """The same events; what the wheels say of each frame is collected on the way."""
+    """Pass the events through, and store the motion by the wheels for each frame."""
     robot, noise = cfg.robot, cfg.localizer
     slip, unequal = noise.full_state.slip_sigma, noise.full_state.slip_difference_sigma
     for event in events:
@@ -120,7 +120,7 @@ class _Export:
                 has_begun = True
                 fixed = ros.tf2_msgs__msg__TFMessage([*self._fixed_frames(begin_s)])
                 yield "/tf_static", self._ns(begin_s), fixed
-            with suppress(BadMessage, BadLine):  # the replay has reported it
+            with suppress(BadMessage, BadLine):  # already reported by the replay
                 for topic, t_s, message in converted[name](decode_recorded(name, payload)):
                     yield topic, self._ns(t_s), message
         if not has_utc:
@@ -149,7 +149,7 @@ class _Export:
         noise, none = self._cfg.localizer, np.empty(0)
         of_rate = np.diag((NOT_MEASURED, NOT_MEASURED, noise.gyroscope_sigma_rad_s**2)).ravel()
         ahead = np.diag((noise.accelerometer_sigma_m_s2**2, NOT_MEASURED, NOT_MEASURED)).ravel()
-        no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition marks it
+        no_orientation = np.array([-1.0, *[0.0] * 8])  # "not measured", by the definition of the message
         for frame in [decode_from_robot(bytes(line)) for line in message.lines]:
             if not isinstance(frame, Sensors):
                 continue
@@ -180,7 +180,7 @@ class _Export:
             yield "/ground_truth/odom", t_s, self._odometry(t_s, pose, np.zeros((3, 3)), _UNKNOWN)
 
     def _odometry(self, t_s: float, pose: DeckPose, covariance: FloatArray, motion: _Motion) -> Any:
-        """Height, roll and pitch follow from the surface, the wheels allow no other velocity: their variances are 0."""
+        """Variances of height, roll and pitch are 0, since the surface gives them; also those of other velocities."""
         place = ros.geometry_msgs__msg__Point(*self._mirror.surface_point(pose.x_m, pose.y_m))
         turn = quaternion(self._mirror.robot_axes(pose))
         of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
@@ -214,9 +214,9 @@ class _Export:
     def _diagnosis(
         self, message: MissionStatus | DangerEvent, name: str, text: str, causes: Mapping[str, tuple[Severity, str]]
     ) -> Stamped:
-        """Of a message with its plain fields, and of each cause.
+        """Diagnostics of a message with its plain fields, and of each cause.
 
-        OK where it is only reported, WARN where the robot goes on by itself, else ERROR.
+        OK if it is only reported, WARN if the robot continues by itself, else ERROR.
         """
         facts = {k: str(v) for k, v in msgspec.structs.asdict(message).items() if isinstance(v, str | int | float)}
         statuses = [
