@@ -21,8 +21,9 @@ class Message(msgspec.Struct, kw_only=True):
 class Heartbeat(Message):
     """A process is alive, before and while frames flow.
 
-    ``phase``: starting, ready (may be joined to), joined, done. ``frame_age_s``: wall time since the process served its
-    newest sensors frame, ``None`` before the first. ``t_s`` is of the machine's monotonic clock.
+    ``phase``: starting, ready (the other loop may join), joined, rejoining (the link is lost), done. ``frame_age_s``:
+    wall time since the process served its newest sensors frame, ``None`` before the first. ``t_s`` is of the machine's
+    monotonic clock.
     """
 
     process: str

@@ -27,7 +27,7 @@ from ccatp.studies.results import value_at
 
 # Calls that may be taken back. A late fix reaches back some seconds, which are a few hundred.
 REACH = 2000
-# Steps in one smoother: some 30 MB at 19 states, so that going back needs little more memory than the record itself.
+# Steps in one smoother: some 30 MB at 20 states, so that going back needs little more memory than the record itself.
 CHAPTER = 4096
 # Wheels that turn faster than this move the robot: ten times the noise of an encoder that gives rates.
 TURNING_RAD_S = 0.01
@@ -59,7 +59,7 @@ class RecordingFilter:
 
     A ``reset`` to a state that the filter has been in takes it back there; one before anything is recorded is the
     beginning; any other is a transition of its own (``transition_of_reset``). The record costs 12 kB a transition at
-    19 states. ``count``: transitions so far.
+    20 states. ``count``: transitions so far.
     """
 
     def __init__(self, filter_: Filter) -> None:
