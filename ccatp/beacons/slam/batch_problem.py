@@ -12,25 +12,25 @@ from ccatp.config.beacon_models import OdometryNoiseConfig, RecordingConfig
 from ccatp.core import FloatArray, IntArray
 from ccatp.filters.metrics import wrapped
 
-# What odometry is calibrated by, as in the filter: d = d_o / (1 + distance_scale) - distance_per_rad |w_o| sign(d_o),
-# w = w_o / (1 + turn_scale) + turn_per_m d_o - bias t. ``turn_per_m`` is what wheels of unequal size do;
-# ``odometry_delay_s`` is by how much the vehicle does later what its odometry says (commands taken for odometry).
+# Calibration of the odometry, as in the filter: d = d_o / (1 + distance_scale) - distance_per_rad |w_o| sign(d_o),
+# w = w_o / (1 + turn_scale) + turn_per_m d_o - bias t. ``turn_per_m`` is the effect of wheels of unequal size;
+# ``odometry_delay_s`` is the delay of the vehicle behind its odometry (if commands are used as odometry).
 CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "odometry_delay_s", "distance_per_rad")
 BIAS = CALIBRATION.index("turn_bias_rad_s")
-STILL_M = 1e-4  # standard deviation of what happens in any interval, even at rest: keeps the covariance regular
+STILL_M = 1e-4  # standard deviation added to the motion of each interval, even at rest: keeps the covariance regular
 STILL_RAD = 1e-4
 DELAY_STEP_S = 0.05
-TINY_RAD = 1e-6  # after a second: a gyroscope is taken for no better
-# Steps shorter than that are put together: within it a vehicle turns so little that the chord is the arc.
+TINY_RAD = 1e-6  # smallest angle random walk that is assumed for a gyroscope, rad/sqrt(s)
+# Steps within an interval of this length are combined: the vehicle turns so little that the chord equals the arc.
 FINEST_S = 0.1
 
 
 class Reckoning:
-    """Steps of odometry, cut at given instants and put together between them.
+    """Steps of odometry, cut at given instants and combined between them.
 
-    ``times_s``: the instants, shape (n + 1,), rising, within the steps. ``rest``: steps slower than that, m/s and
-    rad/s, are at rest: the turn that is read is the bias of the gyroscope, and the heading stays. ``at_rest``: time and
-    turn of all such steps, s and rad.
+    ``times_s``: the instants, shape (n + 1,), rising, within the steps. ``rest``: limits of speed, m/s, and turn rate,
+    rad/s, below which a step is at rest: the turn that is read is the bias of the gyroscope, and the heading is
+    constant. ``at_rest``: total time and turn of all such steps, s and rad.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Reckoning:
 
         self._fine_s, self._steps_s = fine_s, steps.times_s
         guesses = (np.broadcast_to(guess, steps.distance_m.shape) for guess in (steps.guess_m2, steps.guess_rad2))
-        # The time is that in which the bias turns the heading.
+        # Time and turn are counted only while the vehicle moves: at rest the bias does not turn the heading.
         lost = turned_way(steps.distance_m, steps.turn_rad)
         amounts = (steps.distance_m, steps.turn_rad * ~rests, steps.lateral_m, lasts_s * ~rests, lost, *guesses)
         self._totals = [running_total(amount) for amount in amounts]
@@ -74,8 +74,8 @@ class Reckoning:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Motion x_m, y_m, heading_rad of each interval (n, 3), in the vehicle's frame at its beginning.
 
-        With its derivatives by ``calibration`` (6,), shape (n, 3, 6), and its covariance, shape (n, 3, 3). A turn error
-        e at a step swings the rest of the interval: d(x, y) = e (-(y_end - y), x_end - x).
+        Also its derivatives by ``calibration`` (6,), shape (n, 3, 6), and its covariance, shape (n, 3, 3). A turn error
+        e at a step rotates the rest of the interval: d(x, y) = e (-(y_end - y), x_end - x).
         """
         if calibration[4] != self._delay_s:
             self._cut(float(calibration[4]))
@@ -132,15 +132,15 @@ class Reckoning:
 
 
 OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
-# Unknowns that are neither pose nor beacon, in the order of the state: zero where all is as it should be.
+# Unknowns that are neither pose nor beacon, in the order of the state; all are zero for perfectly calibrated sensors.
 SHARED = (*CALIBRATION, *OF_READINGS)
 RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET, RSSI_REFERENCE, RSSI_EXPONENT = (SHARED.index(name) for name in OF_READINGS)
-BEACON = 4  # x_m, y_m, the offset of its ranges, m, and of its P_ref, dB
+BEACON = 4  # states of a beacon: x_m, y_m, offset of its ranges, m, and of its P_ref, dB
 
 
 @dataclass(slots=True)
 class ArrowSystem:
-    """Normal equations: a matrix [[A, B], [B^T, C]], A of the chain of poses, and the right-hand side (a, c).
+    """Normal equations: a matrix [[A, B], [B^T, C]], with A of the chain of poses, and the right-hand side (a, c).
 
     N = 3 n for n poses.
     """
@@ -154,14 +154,14 @@ class ArrowSystem:
 
 @dataclass(slots=True)
 class BatchState:
-    """What is estimated."""
+    """Values of all unknowns."""
 
     poses: FloatArray  # x_m, y_m, heading_rad at each instant, shape (n, 3)
     shared: FloatArray  # by ``SHARED``, shape (11,)
     beacons: FloatArray  # x_m, y_m, range_offset_m, reference_db by beacon, shape (b, 4)
 
     def moved(self, poses: FloatArray, shared: FloatArray) -> "BatchState":
-        """The state after a step, the shared part of it shape (11 + 4 b,)."""
+        """The state after a step: ``poses`` (n, 3); ``shared`` with the beacons behind, shape (11 + 4 b,)."""
         split = len(SHARED)
         beacons = self.beacons + shared[split:].reshape(-1, BEACON)
         return BatchState(self.poses + poses, self.shared + shared[:split], beacons)
@@ -169,30 +169,30 @@ class BatchState:
 
 @dataclass(slots=True)
 class Residuals:
-    """What remains at a state, and its derivatives.
+    """Residuals at a state, and their derivatives.
 
     Readings are rows of (range, bearing, signal strength), zero where there is none.
     """
 
-    odometry: FloatArray  # motion by the poses less that of the odometry, in the vehicle's frame, shape (n - 1, 3)
+    odometry: FloatArray  # motion of the poses minus that of the odometry, in the vehicle's frame, shape (n - 1, 3)
     odometry_information: FloatArray  # shape (n - 1, 3, 3)
-    by_steps: FloatArray  # of the odometry by poses before, behind and ``CALIBRATION``, shape (n - 1, 3, 3 + 3 + 6)
-    readings: FloatArray  # predicted less read, shape (m, 3)
+    by_steps: FloatArray  # of the odometry by first pose, second pose and ``CALIBRATION``, shape (n - 1, 3, 3 + 3 + 6)
+    readings: FloatArray  # predicted minus measured, shape (m, 3)
     information: FloatArray  # of each, zero where there is no reading, shape (m, 3)
     by_unknowns: FloatArray  # of the readings by the pose, ``OF_READINGS`` and the beacon, shape (m, 3, 3 + 5 + 4)
 
     @property
     def chi2(self) -> FloatArray:
-        """Of each reading, shape (m,)."""
+        """Chi-squared of each reading, shape (m,)."""
         total: FloatArray = (self.readings**2 * self.information).sum(axis=1)
         return total
 
 
 class BatchProblem:
-    """Odometry and readings of a run up to an instant.
+    """Odometry and readings of a run as a least-squares problem.
 
-    ``times_s``: instants of the poses, the first one the first odometry time, shape (n,). ``used``: which beacons take
-    part, shape (b,); readings of others count nothing.
+    ``times_s``: instants of the poses, beginning with the first odometry time, shape (n,). ``used``: mask of the
+    beacons that are estimated, shape (b,); readings of others are ignored.
     """
 
     def __init__(
@@ -212,7 +212,8 @@ class BatchProblem:
         self.sizes: FloatArray = self.there.sum(axis=1).astype(np.float64)
         self._read = np.where(self.there, read, 0.0)
         self.repeats = repeats(readings, settings.radio.correlation_s)
-        # Of the shared unknowns and the beacons, shape (11 + 4 b,): 0 fixes one, infinity says nothing of it.
+        # Prior standard deviations of the shared unknowns and the beacons, shape (11 + 4 b,): 0 fixes an unknown,
+        # infinity is no prior.
         beacons = np.zeros((len(used), BEACON))
         beacons[used] = (np.inf, np.inf, self.priors.beacon_offset_m, self.priors.beacon_reference_db)
         sigmas = np.concatenate([[getattr(self.priors, name) for name in SHARED], beacons.ravel()])
@@ -229,7 +230,7 @@ class BatchProblem:
         self.first_information = np.array((self.priors.pose_m**-2, self.priors.pose_m**-2, self.priors.heading_rad**-2))
 
     def residuals(self, state: BatchState) -> Residuals:
-        """At a state; kept until another state is asked for."""
+        """Residuals at a state; the last result is cached."""
         if self._last is None or self._last[0] is not state:
             self._last = (state, self._linearised(state))
         return self._last[1]
@@ -241,7 +242,7 @@ class BatchProblem:
         return float(0.5 * (shared**2 @ self.prior_information + first**2 @ self.first_information))
 
     def normal_equations(self, state: BatchState, weights: FloatArray) -> ArrowSystem:
-        """Gauss-Newton at a state with weights of the readings, shape (m,), for the free unknowns."""
+        """Normal equations of Gauss-Newton for the free unknowns; ``weights`` of the readings, shape (m,)."""
         r, n = self.residuals(state), len(state.poses)
         split, poses, k = POSE * n, POSE * np.arange(n)[:, None], len(CALIBRATION)
         # Rows of odometry and of readings, each divided by its standard deviation.
@@ -265,12 +266,12 @@ class BatchProblem:
         side[:POSE] -= self.first_information * first
         side[split:] -= self.prior_information * shared
         corner = H[:, free].toarray()
-        # NumPy multiplies by part of a sparse matrix's columns twenty times as slowly as by an array of its own.
+        # A contiguous copy: NumPy multiplies by a slice of the array twenty times more slowly.
         border, corner = np.asfortranarray(corner[:split]), corner[free] + np.diag(self.prior_information[self.free])
         return ArrowSystem(band, border, corner, side[:split], side[free])
 
     def spread(self, shared: FloatArray) -> FloatArray:
-        """A step of the free shared unknowns as one of all, zero for the others."""
+        """A step of the free shared unknowns as a step of all, (11 + 4 b,), zero for the fixed ones."""
         whole = np.zeros(self.free.size)
         whole[self.free] = shared
         return whole
@@ -308,7 +309,7 @@ class BatchProblem:
         by_shared = np.zeros((m, 3, len(OF_READINGS)))
         by_shared[:, 0, 0], by_shared[:, 0, 1], by_shared[:, 1, 2] = r, 1.0, 1.0
         by_shared[:, 2, 3], by_shared[:, 2, 4] = 1.0, by_exponent
-        # By the range read, not the one predicted: a variance that moves with the state would draw it outwards.
+        # By the measured range, not the predicted one: a variance that depends on the state would bias it outwards.
         variances = np.empty_like(errors)
         variances[:, 0] = range_variance(radio, self._read[:, 0])
         variances[:, 1:] = radio.bearing_sigma_rad**2, radio.rssi_sigma_db**2
@@ -320,17 +321,17 @@ class BatchProblem:
 
 
 def _rows(blocks: FloatArray, columns: IntArray, width: int) -> csr_array:
-    """A sparse matrix of blocks (k, r, c), one below the other, each in its own columns (k, c)."""
+    """A sparse matrix of the blocks (k, r, c), stacked vertically, each in its own columns (k, c)."""
     k, r, c = blocks.shape
     starts = np.arange(0, blocks.size + 1, c)
     return csr_array((blocks.ravel(), np.repeat(columns, r, axis=0).ravel(), starts), shape=(k * r, width))
 
 
 def repeats(readings: Readings, correlation_s: float) -> FloatArray:
-    """How many readings of the same beacon lie within ``correlation_s`` round each, itself among them, shape (m,).
+    """Number of readings of the same beacon in the interval ``correlation_s`` centred on each reading, shape (m,).
 
-    Errors that last (a camera's, a reflection's) do not average out: with its variance times that number each stretch
-    of readings weighs as one, whatever the rate.
+    Persistent errors (of a camera, of a reflection) do not average out. If the variance of each reading is multiplied
+    by this number, all readings of such an interval together have the weight of one, at any rate.
     """
     counts = np.ones(len(readings.times_s))
     for beacon in np.unique(readings.beacon) if correlation_s > 0.0 else ():

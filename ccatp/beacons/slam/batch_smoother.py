@@ -1,6 +1,7 @@
-"""The smoother of recorded runs: path, beacons and calibration that fit all odometry and all readings best.
+"""The smoother of recorded runs: path, beacons and calibration with the best fit to all odometry and readings.
 
-Levenberg-Marquardt with noise by Student's t; Cholesky of the arrow-shaped system. It starts at what the filter finds.
+Levenberg-Marquardt with Student's t for the readings; Cholesky of the arrow-shaped system. The initial values are those
+of the filter.
 """
 
 from collections import Counter
@@ -25,17 +26,17 @@ from ccatp.filters.metrics import best_motion
 
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e9
-SLOW = 0.5  # ratio of a step to the one before from which on both are taken for terms of a geometric series
-FURTHEST = 10.0  # steps that are taken at once
-CONVERGED = 1e-5  # relative gain below which a cost has converged
-WELL_CONVERGED = 1e-6  # the same before noise is widened: what has not converged looks like noise
+SLOW = 0.5  # ratio of consecutive steps above which they are extrapolated as a geometric series
+FURTHEST = 10.0  # longest extrapolation, in steps
+CONVERGED = 1e-5  # relative decrease of the cost below which it has converged
+WELL_CONVERGED = 1e-6  # the same before the noise is increased: residuals that have not converged look like noise
 
 
 class Factored:
-    """Cholesky factors of an arrow system: A by bands, then the Schur complement S = C - B^T A^-1 B.
+    """Cholesky factors of an arrow system: banded A, then the Schur complement S = C - B^T A^-1 B.
 
-    ``damping``: the diagonal is multiplied by 1 + damping (Levenberg and Marquardt). Raises LinAlgError: not positive
-    definite.
+    ``damping``: the diagonal is multiplied by 1 + damping (Levenberg-Marquardt). Raises LinAlgError: the matrix is not
+    positive definite.
     """
 
     def __init__(self, system: ArrowSystem, damping: float = 0.0) -> None:
@@ -51,17 +52,17 @@ class Factored:
         self._schur = cho_factor(0.5 * (S + S.T), lower=True, check_finite=False)
 
     def solution(self) -> tuple[FloatArray, FloatArray]:
-        """Unknowns of the poses (n, 3) and the shared ones (m,)."""
+        """Step of the poses, shape (n, 3), and of the shared unknowns, shape (m,)."""
         side = self.system.shared_side - self.system.border.T @ self._pose_solved
         shared = cho_solve(self._schur, side, check_finite=False)
         return (self._pose_solved - self._border_solved @ shared).reshape(-1, POSE), shared
 
     def shared_covariance(self) -> FloatArray:
-        """Inverse's block of the shared unknowns, shape (m, m)."""
+        """Block of the inverse for the shared unknowns, shape (m, m)."""
         return np.asarray(cho_solve(self._schur, np.eye(len(self.system.corner)), check_finite=False))
 
     def pose_covariances(self) -> FloatArray:
-        """Inverse's diagonal block of each pose, shape (n, 3, 3): (A^-1)_kk + W_k W_k^T, W = A^-1 B chol(S)^-T."""
+        """Diagonal block of the inverse for each pose, (n, 3, 3): (A^-1)_kk + W_k W_k^T, W = A^-1 B chol(S)^-T."""
         root = np.tril(self._schur[0])
         shaped = solve_triangular(root, self._border_solved.T, lower=True, check_finite=False).T
         W = shaped.reshape(-1, POSE, len(root))
@@ -84,21 +85,24 @@ def _diagonal_of_inverse(band: FloatArray) -> FloatArray:
 def t_weights(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: float = 1.0) -> FloatArray:
     """Weight of each reading: (nu + p) / (nu + chi2 / softness), the M-estimator of Student's t with p components.
 
-    A softness above one forgives large residuals: it is how a start far off is not mistaken for outliers.
+    A softness above one gives large residuals more weight, so that a bad initial value does not look like outliers.
     """
     weights: FloatArray = (freedom + sizes) / (freedom + chi2 / softness)
     return weights
 
 
 def t_cost(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: float = 1.0) -> float:
-    """Negative log likelihood of Student's t without its constants, with the weights above as its gradient's."""
+    """Negative log likelihood of Student's t without its constants; its gradient has the weights of ``t_weights``."""
     return float((0.5 * (freedom + sizes) * softness * np.log1p(chi2 / (freedom * softness))).sum())
 
 
 def descend(
     problem: BatchProblem, state: BatchState, most: int, softness: float = 1.0, enough: float = CONVERGED
 ) -> tuple[BatchState, bool]:
-    """Minimise the negative log posterior, with the softness of the readings' law; whether that converged."""
+    """Minimise the negative log posterior in at most ``most`` iterations; returns the state and whether it converged.
+
+    ``softness``: that of ``t_weights``. ``enough``: relative decrease of the cost at which it has converged.
+    """
     damping = 1e-6
 
     def cost_of(tried: BatchState) -> float:
@@ -122,7 +126,7 @@ def descend(
             return state, True
         rate = 0.0 if before is None else float(np.vdot(before[0], step[0]) / np.vdot(before[0], before[0]))
         before = step
-        if SLOW < rate < 1.0:  # as steps of weights do that follow the residuals: the sum of all that would come
+        if SLOW < rate < 1.0:  # reweighting converges linearly: add the sum of the steps that would follow
             further = min(rate / (1.0 - rate), FURTHEST)
             tried = state.moved(further * step[0], further * step[1])
             if (shorter := cost_of(tried)) < cost:
@@ -138,29 +142,29 @@ def _step(problem: BatchProblem, system: ArrowSystem, damping: float) -> tuple[F
     return poses, problem.spread(shared)
 
 
-SPACING_S = 0.5  # there is a pose at least that often, with a reading or without
-FAR_OFF = 4.0  # median of the normalised residuals squared, beyond which the noise is first taken for as wide
+SPACING_S = 0.5  # longest interval between poses without readings
+FAR_OFF = 4.0  # median of the squared normalised residuals above which it is used as softness of the first iterations
 ROUGH_ITERATIONS, ROUGHLY = 6, 1e-3
 ITERATIONS = 40
 WIDENINGS = 8
-WIDER = 1.05  # noise is widened where the residuals are larger than it by that factor
-NOISY = 4.0  # how many times the noise may have been widened without a warning
-LITTLE = 0.1  # a reading that weighs less counts as refused
+WIDER = 1.05  # the noise is increased if the residuals exceed it by this factor
+NOISY = 4.0  # largest increase of the noise without a warning
+LITTLE = 0.1  # a reading with a smaller weight counts as refused
 
 
 Found = tuple[EstimatedPath, BeaconSlam]
 
 
 class Start(NamedTuple):
-    """Where the smoother begins."""
+    """Initial values of the smoother."""
 
     state: BatchState
-    used: BoolArray  # which beacons have been placed, shape (b,)
-    doubtful: BoolArray  # those whose mirror image fits nearly as well, shape (b,)
+    used: BoolArray  # beacons that have a place, shape (b,)
+    doubtful: BoolArray  # beacons that have not joined the filter's map: the mirror image may fit as well, shape (b,)
 
 
 def _started(run: RecordedRun, settings: RecordingConfig, found: Found, times_s: FloatArray) -> Start:
-    """The path, the map and the calibration of the filter; beacons that still wait are where they most likely are."""
+    """Path, map and calibration of the filter; a beacon that still waits begins at its best candidate."""
     slam, poses = found[1], _poses_at(found[0], times_s)
     priors, shared = settings.priors, np.zeros(len(SHARED))
     for name, (value, _) in slam.calibration.items():
@@ -189,7 +193,7 @@ def _poses_at(path: EstimatedPath, times_s: FloatArray) -> FloatArray:
 
 
 def _ends(poses: FloatArray) -> FloatArray:
-    """Where poses are and a metre ahead of them: the frame of a path, though it may be a point; shape (2 n, 2)."""
+    """The positions and points one metre ahead, (2 n, 2): they define a frame even if all positions are the same."""
     ahead = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     return np.concatenate([poses[:, :2], poses[:, :2] + ahead])
 
@@ -197,9 +201,10 @@ def _ends(poses: FloatArray) -> FloatArray:
 def lagged_run(
     run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float], lag: FixedLagConfig
 ) -> EstimatedPath:
-    """The fixed-lag smoother over a recording; its map is that which fits the last ``map_s`` best, in its path's frame.
+    """The fixed-lag smoother over a recording.
 
-    Where these do not determine all beacons, the map is the filter's.
+    Its map is that of the smoother over the last ``map_s``, moved to the frame of the filter's path. If these data do
+    not determine all beacons, the map is the filter's.
     """
     path, slam = follow(run, cfg, how, clock_s, lag=lag)
     steps, readings = run.steps, run.readings
@@ -230,11 +235,12 @@ def smooth(
     """Estimate a whole run at once.
 
     Minimises the negative log posterior of poses at the instants of the readings, beacons and calibration by
-    Levenberg-Marquardt; noise of the readings by Student's t; its width grows if the residuals are wider. Nothing of
-    the truth is used but the first pose. ``found``: by the filter, where that has been over the run.
+    Levenberg-Marquardt. The readings have Student's t, whose width is increased if the residuals are wider. The first
+    pose is the only part of the ground truth that is used. ``found``: results of the filter, if it has processed the
+    run already. Raises LinAlgError: the normal equations of the result are not positive definite.
     """
     begin_s, first_radio = clock_s(), settings.radio
-    steps_s = run.steps.times_s  # there is a pose at each reading, and at an odometry step now and then between them
+    steps_s = run.steps.times_s  # poses are at all readings, and every SPACING_S at a step of the odometry
     _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
     readings = run.readings.with_distances(settings.radio.camera_field_rad)
     times_s = np.union1d(readings.times_s, steps_s[first])
@@ -282,9 +288,9 @@ def smooth(
 
 
 def _widened(problem: BatchProblem, state: BatchState) -> RadioNoiseConfig:
-    """Noise of the readings, wider where the weighted residuals ask for it.
+    """Noise of the readings, increased where the weighted residuals are wider.
 
-    The maximum-likelihood scale of Student's t is that of sum w e^2 / sigma^2 = number of readings.
+    The maximum-likelihood scale sigma of Student's t satisfies sum w e^2 / sigma^2 = number of readings.
     """
     residuals, radio = problem.residuals(state), problem.radio
     weights = t_weights(residuals.chi2, problem.sizes, radio.freedom)

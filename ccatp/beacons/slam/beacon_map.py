@@ -1,4 +1,4 @@
-"""Beacons as blocks of the filter's state, with errors that wander; how noise is learned and headings stay unknown."""
+"""Beacons as blocks of the filter's state, wandering errors, learned noise levels, and the transport of the heading."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
 
 
 class NoiseLevel:
-    """A factor f on the variances of a noise, by maximum likelihood on the way (Fisher scoring).
+    """A factor f on the variance r of a noise, estimated recursively by maximum likelihood (Fisher scoring).
 
     An innovation of variance S, of which the share a = f r / S is this noise, has the log-likelihood -(ln S + nu^2 / S)
     / 2: its derivative by ln f is a (nis - 1) / 2, its Fisher information a^2 / 2. So J <- J + a^2, ln f <- ln f + a
-    (nis - 1) / J. ``prior``: J at the start, the innovations that the starting value counts for. ``memory``: largest J:
-    older innovations fade; 0: the factor stays one. ``least``: smallest factor.
+    (nis - 1) / J. ``prior``: initial J, the weight of the initial value as a number of innovations. ``memory``: largest
+    J, so that old innovations fade; 0: the factor stays one. ``least``: smallest factor.
     """
 
     def __init__(self, prior: float, memory: float, least: float) -> None:
@@ -26,7 +26,7 @@ class NoiseLevel:
         self._information, self._memory = prior, memory
 
     def learn(self, nis: float, share: float) -> None:
-        """Take an innovation: its normalised square, and the share of this noise in its variance."""
+        """Update the factor by an innovation: its normalised square, and the share of this noise in its variance."""
         if self._memory <= 0.0:
             return
         information = self._information + share * share
@@ -40,26 +40,27 @@ class NoiseLevel:
         self.factor = factor
 
 
-LARGEST = 0.3  # most that one innovation may change the logarithm of the factor
-# Largest factor, and one over the least: a sensor ten times worse than promised is not one to be believed.
+LARGEST = 0.3  # largest change of the factor's logarithm by one innovation
+# Largest factor, and one over the least one: a sensor with ten times the configured sigma cannot be trusted.
 FURTHEST = 100.0
 
 
 class AddedPoseNoise:
-    """N <- G N G^T + Q, N symmetric, G = dh(pose)/d(pose): the identity, but for the derivatives by the heading.
+    """Pose covariance N that the motion noise has added since the last reading: N <- F N F^T + Q, N symmetric.
 
-    Six numbers in place of an array of nine: an update of so small a one by NumPy takes longer than the rest.
+    F is the identity except for the derivatives by the heading. N is kept as six numbers, because NumPy takes longer
+    for so small an array.
     """
 
     def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
-        """A reading was received."""
+        """Set N to zero, after a reading."""
         self._xx = self._xy = self._xt = self._yy = self._yt = self._tt = 0.0
 
     def step(self, F: FloatArray, Q: FloatArray) -> None:
-        """The vehicle moves on: Jacobian and noise of its states, each of shape (v, v), the pose first."""
+        """Propagate N by a prediction with Jacobian and noise of the vehicle's states, both (v, v), the pose first."""
         f, g, tt = F.item(0, 2), F.item(1, 2), self._tt
         xt, yt = self._xt + f * tt, self._yt + g * tt
         self._xx += f * (self._xt + xt) + Q.item(0, 0)
@@ -68,21 +69,21 @@ class AddedPoseNoise:
         self._xt, self._yt, self._tt = xt + Q.item(0, 2), yt + Q.item(1, 2), tt + Q.item(2, 2)
 
     def seen(self, hx: float, hy: float, ht: float) -> float:
-        """H N H^T of a row with these derivatives by the pose."""
+        """H N H^T of a measurement row with these derivatives by the pose."""
         across = hx * (hx * self._xx + 2.0 * (hy * self._xy + ht * self._xt))
         return across + hy * (hy * self._yy + 2.0 * ht * self._yt) + ht * ht * self._tt
 
 
 @dataclass(frozen=True, slots=True)
 class GaussMarkovBias:
-    """An error of a beacon's readings that stays while the vehicle does: multipath, shadowing, a tilted camera.
+    """An error of a beacon's readings that persists while the vehicle rests: multipath, shadowing, a tilted camera.
 
-    A Gauss-Markov process of each beacon by itself: correlation exp(-way / length_m - time / time_s).
+    An independent Gauss-Markov process for each beacon: correlation exp(-distance / length_m - time / time_s).
     """
 
-    share: float  # of the variance of the noise; the rest is new with every reading
-    length_m: float  # way of the vehicle after which it is forgotten
-    time_s: float  # time after which it is forgotten
+    share: float  # share of the noise variance; the rest is white
+    length_m: float  # correlation length along the vehicle's path
+    time_s: float  # correlation time
 
 
 _NONE = np.empty(0, dtype=np.intp)
@@ -91,34 +92,34 @@ WANDER = "wander"  # first part of the name of a block that holds a wandering er
 
 @dataclass(slots=True)
 class MapEntry:
-    """A beacon on the map. ``way_m``, ``time_s``: of the vehicle when the wandering error was last looked at."""
+    """A beacon on the map. ``way_m``, ``time_s``: distance travelled and time of the wandering error's last update."""
 
-    columns: Columns  # those of all beacons, then the beacon and its wandering error, shape (k,)
+    columns: Columns  # the columns shared by all beacons, then the beacon and its wandering error, shape (k,)
     size: int
     wander: int = -1  # column of the wandering error; -1: none
     way_m: float = 0.0
     time_s: float = 0.0
-    fresh: float = 1.0  # variance of what is new in the wandering error, in sigmas squared
-    refused: int = 0  # readings in a row that were not believed
-    on_trial: int = 0  # readings that must still agree with the one it joined by; 0: it is believed in
+    fresh: float = 1.0  # variance of the new part of the wandering error, in sigmas squared
+    refused: int = 0  # readings refused in a row
+    on_trial: int = 0  # number of readings that must still agree with the first one; 0: the trial is over
 
 
 class BeaconMap(dict[BeaconId, MapEntry]):
-    """The beacons' blocks of an ``EkfSlam``; ``shared``: columns that the readings of all of them depend on."""
+    """The beacons' blocks of an ``EkfSlam``; ``shared``: columns on which the readings of all beacons depend."""
 
     def __init__(self, engine: EkfSlam, shared: Sequence[int]) -> None:
         super().__init__()
         self._engine, self._shared = engine, shared
 
     def join(self, beacon: BeaconId, mean: FloatArray, covariance: FloatArray) -> MapEntry:
-        """A beacon that is correlated with nothing yet: mean (b,), covariance (b, b)."""
+        """Add a beacon that is not correlated with the rest of the state: mean (b,), covariance (b, b)."""
         self._append(beacon, mean, covariance)
         self[beacon] = MapEntry(_NONE, mean.size)
         self.renumber()
         return self[beacon]
 
     def leave(self, beacon: BeaconId) -> None:
-        """Forget a beacon. Raises BlockError: it is not on the map."""
+        """Remove a beacon. Raises BlockError: it is not on the map."""
         self._engine.remove(beacon)
         if (WANDER, beacon) in self._engine:
             self._engine.remove((WANDER, beacon))
@@ -126,7 +127,7 @@ class BeaconMap(dict[BeaconId, MapEntry]):
         self.renumber()
 
     def renumber(self) -> None:
-        """Find the columns again, after a block has gone."""
+        """Update the columns of all entries, after a block was added or removed."""
         engine = self._engine
         for beacon, entry in self.items():
             parts = [engine.block(beacon)]
@@ -136,7 +137,7 @@ class BeaconMap(dict[BeaconId, MapEntry]):
             entry.columns = columns_of(self._shared, *parts)
 
     def wander_to(self, beacon: BeaconId, model: GaussMarkovBias, way_m: float, time_s: float) -> None:
-        """Bring a beacon's wandering error, in sigmas, to now: w <- phi w, variance <- phi^2 variance + 1 - phi^2."""
+        """Predict a beacon's wandering error, in sigmas: w <- phi w, variance <- phi^2 variance + 1 - phi^2."""
         entry = self[beacon]
         if entry.wander < 0:
             self._append((WANDER, beacon), np.zeros(1), np.eye(1))
@@ -158,11 +159,11 @@ HEADING = 2
 class HeadingTransport:
     """After a correction, P <- M P M^T with M = I + d e^T, e the heading and d = J (new - old) of every place.
 
-    A turn of everything about any point changes no reading, so the heading of the whole map is not observed. In the
-    state it is the direction (J p of each place p, 1 of the heading), J a quarter turn; derivatives are taken at the
-    estimate, so it changes with each correction, and a filter that leaves P as it was takes that change for knowledge.
-    A covariance of errors that turn with the heading does not have to change (the invariant EKF: Barrau and Bonnabel
-    2015; Zhang et al. 2017); this is that covariance, said of errors of x and y.
+    A rotation of vehicle and map about any point changes no reading, so the rotation of the whole map is not
+    observable. In the state it is the direction (J p of each place p, 1 of the heading), J a quarter turn. Derivatives
+    are taken at the estimate, so this direction changes with each correction; with an unchanged P the filter would gain
+    false information about the rotation. The covariance of errors that rotate with the heading does not have to change
+    (invariant EKF: Barrau and Bonnabel 2015; Zhang et al. 2017). P is that covariance, expressed for errors of x and y.
     """
 
     def __init__(self, engine: EkfSlam) -> None:
@@ -172,10 +173,10 @@ class HeadingTransport:
         self._sign = np.empty(0)
 
     def follow(self, before: FloatArray) -> None:
-        """The state was corrected.
+        """Transform P after a correction.
 
-        ``before``: its mean before that, shape (n,) or, without what joined since, less; work space afterwards. Where
-        something left the state since, nothing is done.
+        ``before``: mean before the correction, shape (n,), or shorter if blocks were added since; it is overwritten. If
+        the state has become shorter since, nothing is done.
         """
         engine = self._engine
         mean, P, heading = engine.mean, engine.covariance, engine.covariance[HEADING]
@@ -203,5 +204,5 @@ class HeadingTransport:
         places = [block for block in engine.blocks if not (isinstance(block, tuple) and block[0] == WANDER)]
         x = np.array([0, *(engine.block(block).start for block in places)])
         self._partner, self._sign = np.zeros(engine.size, dtype=np.intp), np.zeros(engine.size)
-        self._partner[x], self._sign[x] = x + 1, 1.0  # of the old less the new
+        self._partner[x], self._sign[x] = x + 1, 1.0  # because ``before`` holds old - new
         self._partner[x + 1], self._sign[x + 1] = x, -1.0

@@ -1,4 +1,4 @@
-"""EKF-SLAM over readings: a vehicle among beacons places them on a map while it finds itself on it."""
+"""EKF-SLAM: estimates the pose of a vehicle and a map of the beacons from odometry and readings."""
 
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -55,12 +55,12 @@ UNITS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class BeaconInnovation(msgspec.Struct, frozen=True, gc=False):
-    """What one reading did."""
+    """Innovation of one reading."""
 
     beacon: BeaconId
-    nis: float  # nu^T S^-1 nu, with the larger noise where a reading was beyond the knee
-    size: int  # scalars that were taken: bearing, range or strength; where the bearing is refused, it alone
-    accepted: bool  # False where it was refused; the state is then as before, or has taken the bearing alone
+    nis: float  # nu^T S^-1 nu, with the increased noise if the reading was beyond the knee
+    size: int  # number of scalars processed (bearing, range, strength); one if the bearing was refused
+    accepted: bool  # False: refused; the state is then unchanged, or was updated by the bearing only
     surprise: float = 0.0  # minus twice its log-likelihood, up to a constant: sum of nis + ln S
 
 
@@ -68,28 +68,28 @@ class BeaconSlam:
     """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``; docs/slam.md has the models.
 
     Args:
-        motion: how the vehicle moves.
-        models: of the kinds of readings.
-        how: which readings are believed, and what is learned from them.
-        pose0: where the vehicle begins; it defines the frame of the map.
-        P0: covariance of that, shape (3, 3).
-        gate: largest normalised innovation squared that is used.
-        delay_sigma_s: of the vehicle behind its odometry, before any reading; 0: it is not estimated.
-        correlation_s: how long an error of a beacon's readings stays; 0: they are independent.
-        iterations: of each update; one linearisation is enough where bearings are exact.
+        motion: motion model of the vehicle.
+        models: measurement models by kind of reading.
+        how: outlier limits, noise learning and limits for doubt of pose and beacons.
+        pose0: initial pose; it defines the frame of the map.
+        P0: covariance of the initial pose, shape (3, 3).
+        gate: largest normalised innovation squared that is accepted.
+        delay_sigma_s: prior standard deviation of the vehicle's delay behind its odometry; 0: it is not estimated.
+        correlation_s: correlation time of the errors of a beacon's readings; 0: they are independent.
+        iterations: linearisations of each update; one is enough if bearings are exact.
 
     Attributes:
         engine: the state: vehicle | calibration | beacons, wandering errors and poses whose readings wait.
-        learned: what the readings of the last ``observe`` did.
+        learned: innovations of the last ``observe``.
         waiting: beacons with readings that are not on the map yet, with the candidates for their places.
-        levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
+        levels: factor on the configured noise variance of each sensor and of the motion.
         prior_sigmas: standard deviations of ``calibration`` before any reading, in its order.
-        unplaced: directions alone, of beacons that were not on the map then: they are not used.
-        moved: beacons that had to be placed again, each with the time_s of the reading that decided it.
+        unplaced: number of readings with a bearing alone of a beacon that was not on the map: they are not used.
+        moved: beacons that were removed to be placed again, each with the time_s of the reading that caused it.
     """
 
     flat = 100.0  # standard deviation of a beacon's place before its readings, relative to its distance
-    linearisations = LINEARISATIONS  # of all that waits when a beacon joins, the first at the place that was found
+    linearisations = LINEARISATIONS  # of all waiting readings when a beacon joins, the first at the best candidate
 
     def __init__(
         self, motion: DifferentialDrive | SlippingVehicle, models: MeasurementModels, how: SlamFilterConfig,
@@ -116,7 +116,7 @@ class BeaconSlam:
         ranges = range(v, v + self._ranges)
         self._map = BeaconMap(self.engine, (*range(POSE), *range(ranges.stop, self._shared.stop), *ranges))
         self._transport = HeadingTransport(self.engine) if how.transports else None
-        # Innovations show only what is new of an error that lasts: they teach no less noise than is set.
+        # Innovations show only the new part of a persistent error: no noise is learned below the configured one.
         least = dict.fromkeys(models.by_kind, 1.0) if correlation_s > 0.0 else {}
         self.levels = {
             kind: NoiseLevel(how.learn_prior, how.learn_memory, least.get(kind, 1.0 / FURTHEST))
@@ -133,12 +133,12 @@ class BeaconSlam:
 
     @property
     def pose(self) -> VehiclePose:
-        """The vehicle after the last odometry; the heading does not wrap."""
+        """Pose after the last odometry that is due; the heading does not wrap."""
         return VehiclePose(*self.engine.mean[:POSE].tolist())
 
     @property
     def pose_covariance(self) -> FloatArray:
-        """Of x_m, y_m, heading_rad, shape (3, 3)."""
+        """Covariance of x_m, y_m, heading_rad, shape (3, 3)."""
         return self.engine.covariance[:POSE, :POSE].copy()
 
     @property
@@ -149,12 +149,12 @@ class BeaconSlam:
 
     @property
     def calibration(self) -> dict[str, tuple[float, float]]:
-        """Mean and standard deviation of what is calibrated on the way, by name."""
+        """Mean and standard deviation of each estimated calibration parameter, by name."""
         mean, variances = self.engine.mean.tolist(), self.engine.covariance.diagonal().tolist()
         return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._names)}
 
     def predict(self, odometry: Odometry) -> None:
-        """Carry the vehicle on."""
+        """Predict the vehicle over the odometry that is due."""
         delay_s = float(self.engine.mean[self._delay]) if self._delay >= 0 else 0.0
         for step in self._clock.due(odometry, delay_s):
             self._step(step)
@@ -167,7 +167,7 @@ class BeaconSlam:
             Q *= self.levels["motion"].factor
             self._fresh.step(F, Q)
         if isinstance(odometry, Increment) and odometry.guess_m2 > 0.0:
-            # a guessed way says nothing of the noise of odometry
+            # added after the learned noise: a guessed motion has no information about the noise of odometry
             Q[range(POSE), range(POSE)] += odometry.guess_m2, odometry.guess_m2, odometry.guess_rad2
         engine.predict(mean, F, Q)
         self._way_m += self._clock.took(odometry, before, mean)
@@ -176,7 +176,7 @@ class BeaconSlam:
             self._correct(column, bias - float(engine.mean[column]), variance)
 
     def observe(self, readings: Iterable[Reading]) -> list[BeaconInnovation]:
-        """Take readings of any beacons, one after the other; those of new ones begin their place on the map."""
+        """Process readings one after the other; readings of beacons that are not on the map wait until it can join."""
         self.learned = []
         for reading in readings:
             entry, before = self._map.get(reading.beacon), self.engine.mean.copy()
@@ -186,7 +186,7 @@ class BeaconSlam:
                     before = self.engine.mean.copy()
                     self._begin(reading)
             elif is_direction(reading):
-                self.unplaced += 1  # it may lie anywhere along it
+                self.unplaced += 1  # the beacon may lie anywhere along the bearing
             else:
                 self._begin(reading)
             self._follow(before)
@@ -197,7 +197,7 @@ class BeaconSlam:
             self._transport.follow(before)
 
     def correct_heading(self, off_rad: float, sigma_rad: float) -> float:
-        """Take a heading that is ``off_rad`` from the estimated one; returns the NIS of that."""
+        """Update with a measured heading that differs from the estimate by ``off_rad``; returns its NIS."""
         return self._correct(HEADING, off_rad, sigma_rad**2)
 
     def _correct(self, column: int, residual: float, variance: float) -> float:
@@ -207,7 +207,7 @@ class BeaconSlam:
         return found.nis
 
     def remove(self, beacon: BeaconId) -> None:
-        """Forget a beacon; its next reading begins it again. Raises BlockError: there was no reading of it."""
+        """Remove a beacon; its next reading initialises it again. Raises BlockError: there was no reading of it."""
         if (waiting := self.waiting.pop(beacon, None)) is not None:
             waiting.drop(self.engine)
             self._map.renumber()
@@ -217,7 +217,7 @@ class BeaconSlam:
             raise BlockError(beacon, "is not on the map")
 
     def _begin(self, reading: Reading) -> None:
-        """Keep a reading of a new beacon with the pose where it was taken, and place the beacon when they suffice."""
+        """Keep a reading of a new beacon with the pose where it was taken; add the beacon to the map if possible."""
         engine, name = self.engine, reading.beacon
         kind, z = scalars_of(reading)[-1]
         model = self._models.by_kind[kind]
@@ -236,7 +236,7 @@ class BeaconSlam:
         self._map.renumber()
 
     def _place_new(self, waiting: PendingLandmark) -> None:
-        """A reading with a bearing places a beacon at once, on trial; others do when they agree."""
+        """A reading with a bearing adds the beacon at once, on trial; without bearings several readings must agree."""
         is_pointed = waiting.pointed(self.engine) is not None
         if len(waiting.records) >= LEAST or is_pointed:
             self._look(waiting)
@@ -255,7 +255,7 @@ class BeaconSlam:
         waiting.look(self.engine, self._stacked(waiting), partial(self._prior_at, waiting))
 
     def _clone(self, at: CarriedOdometry, size: int) -> tuple[FloatArray, Columns, FloatArray]:
-        """A copy of a pose, or its place alone, the columns that it depends on, and its derivatives by these."""
+        """Copy of a pose or its place, (size,); the columns it depends on; its derivatives by these, (size, k)."""
         is_delayed = self._delay >= 0
         J = [at.derivatives(*unit, delayed=is_delayed) for unit in UNITS[:size]]
         columns = columns_of(range(POSE), (self._delay,) if is_delayed else ())
@@ -270,7 +270,7 @@ class BeaconSlam:
         return StackedRows(self.engine, waiting.records, self._shared, row_of)
 
     def _join(self, waiting: PendingLandmark, found: Candidate) -> None:
-        """Condition the beacon, the poses of its readings, the calibration and all else on them, iterated."""
+        """Add a beacon to the map: an iterated update of the whole state with all of its waiting readings."""
         engine, rows = self.engine, self._stacked(waiting)
         centre = waiting.pointed(engine) or found.mean[:PLACE].tolist()
         self._map.join(waiting.beacon, *self._prior_at(waiting, *centre))
@@ -289,12 +289,12 @@ class BeaconSlam:
         self._map.renumber()
 
     def _carried(self, reading: Reading) -> CarriedOdometry:
-        """The pose at a reading's time."""
+        """Pose at a reading's time."""
         x = self.engine.mean
         return self._clock.at(x[:POSE].tolist(), reading.time_s, float(x[self._delay]) if self._delay >= 0 else 0.0)
 
     def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
-        """The bearing is taken first: if it is refused, so is the rest."""
+        """Process the bearing first; if it is refused, the rest of the reading is refused, too."""
         if self._wander is not None and not is_direction(reading):
             self._map.wander_to(reading.beacon, self._wander, self._way_m, reading.time_s)
         nis, spread, size, accepted = 0.0, 1.0, 0, True
@@ -327,7 +327,10 @@ class BeaconSlam:
     def _linearised(
         self, reading: Reading, entry: MapEntry, kind: str, z: float, x: list[float]
     ) -> tuple[list[float], float, float, float]:
-        """Derivatives by the columns of a beacon, residual, noise variance, and that with the wandering error."""
+        """Derivatives by the entry's columns, residual, variance of the white noise, and of all noise of the reading.
+
+        The last one includes the part of the wandering error that is new since the previous reading.
+        """
         is_delayed, shown = self._delay >= 0, self._shown
         at = self._clock.at(x, reading.time_s, x[POSE] if is_delayed else 0.0)
         calibration, beacon = x[shown - self._ranges : shown], x[shown : shown + entry.size]
@@ -371,7 +374,7 @@ class BeaconSlam:
 def recorded_slam(
     cfg: RecordingConfig, how: SlamFilterConfig, pose0: VehiclePose | Sequence[float], P0: FloatArray
 ) -> BeaconSlam:
-    """The filter of recorded runs."""
+    """The filter for recorded runs."""
     return BeaconSlam(
         DifferentialDrive(cfg.odometry, cfg.priors, how), recorded_models(cfg.radio, cfg.priors), how, pose0, P0,
         gate=cfg.radio.gate_sigmas**2, delay_sigma_s=cfg.priors.odometry_delay_s, correlation_s=cfg.radio.correlation_s,

@@ -1,4 +1,4 @@
-"""``BeaconSlam`` over a recorded run: what is known at each instant from readings up to it."""
+"""``BeaconSlam`` on a recorded run: the estimate at each instant uses only the data received up to it."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,11 +17,11 @@ from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import columns_of
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported
-UNCHANGED = 0.999  # of the prior's standard deviation: what is left of it without readings of it
+UNCHANGED = 0.999  # share of the prior's standard deviation above which a value counts as not determined by readings
 
 
 def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, float], kind: str) -> Iterator[str]:
-    """Values that their prior all but excludes, a line each: they would be further off still if it let them."""
+    """A warning for each value that is more than FAR standard deviations from zero, the mean of its prior."""
     for name, (value, _) in calibration.items():
         sigma = priors[name]
         if abs(value) > FAR * sigma:
@@ -31,18 +31,18 @@ def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, fl
             )
 
 
-HEADINGS = 8  # followed at once; within an eighth of a circle the filter finds its way
-LOST_RAD = pi / HEADINGS  # standard deviation of a heading beyond which it is looked for
-WORSE = 30.0  # twice the log-likelihood by which one falls behind the best and is given up: more than two outliers make
-LONGEST = 400  # readings after which the best is taken
-OUTLIER = 25.0  # what a reading may count at most against one of them
+HEADINGS = 8  # number of hypotheses; within an eighth of a circle the filter converges
+LOST_RAD = pi / HEADINGS  # standard deviation of the heading beyond which the filter is split
+WORSE = 30.0  # excess of minus twice the log-likelihood that ends a hypothesis: more than two outliers cause
+LONGEST = 400  # readings after which only the best hypothesis is kept
+OUTLIER = 25.0  # largest NIS with which one reading counts against a hypothesis
 
 
 class HeadingRelocalizer:
-    """One ``BeaconSlam``, or several that differ by their heading.
+    """One ``BeaconSlam``, or several hypotheses with different headings.
 
-    A Gaussian whose heading is spread over the circle is split into ``HEADINGS`` narrow ones; each reading that all of
-    them take is held against each (a Gaussian sum: Alspach and Sorenson 1972).
+    If the heading is unknown after a gap, the Gaussian is split into ``HEADINGS`` narrow ones; they are compared by the
+    likelihoods of the readings that all of them process (Gaussian sum filter: Alspach and Sorenson 1972).
     """
 
     def __init__(self, slam: BeaconSlam) -> None:
@@ -51,11 +51,11 @@ class HeadingRelocalizer:
 
     @property
     def all(self) -> list[BeaconSlam]:
-        """All of them, the best one first."""
+        """All hypotheses, the best one first."""
         return [self.best, *self._others]
 
     def predict(self, odometry: Increment) -> None:
-        """Carry all of them on; behind a gap the heading is split."""
+        """Predict all hypotheses; split the filter after a gap that leaves the heading unknown."""
         for slam in self.all:
             slam.predict(odometry)
         was_guessed, self._is_guessed = self._is_guessed, odometry.guess_rad2 > 0.0
@@ -63,14 +63,14 @@ class HeadingRelocalizer:
             self._split()
 
     def observe(self, readings: Sequence[Reading]) -> list[BeaconInnovation]:
-        """Take readings; what they did to the best."""
+        """Update all hypotheses by readings; returns the innovations of the best one before the update."""
         learned = self.best.observe(readings)
         if self._others:
             self._weigh([learned, *(slam.observe(readings) for slam in self._others)])
         return learned
 
     def _split(self) -> None:
-        for beacon in list(self.best.waiting):  # its readings before the gap belong to another frame
+        for beacon in list(self.best.waiting):  # their relation to readings after the gap is unknown
             self.best.remove(beacon)
         if not self.best.beacons:
             return
@@ -83,7 +83,7 @@ class HeadingRelocalizer:
         self._others, self._taken = slams[1:], 0
 
     def _weigh(self, learned: Sequence[list[BeaconInnovation]]) -> None:
-        """Readings that not all have taken, because a beacon is not on every map, say nothing."""
+        """Compare the hypotheses by readings that all have processed: a beacon may not be on every map."""
         for each in learned:
             each.sort(key=lambda one: str(one.beacon))
         if len({tuple(one.beacon for one in each) for each in learned}) > 1:
@@ -101,9 +101,10 @@ class HeadingRelocalizer:
 
 
 class FixedLag:
-    """Copies of the poses of the last seconds in the filter's state: each reading corrects them with it.
+    """Copies of recent poses in the filter's state, which each reading corrects, too.
 
-    A fixed-lag smoother by state augmentation (Moore 1973). The copies are a ring, so nothing else in the state moves.
+    A fixed-lag smoother by state augmentation (Moore 1973). The copies are a ring buffer, so other blocks keep their
+    columns.
     """
 
     def __init__(self, how: FixedLagConfig, slam: BeaconSlam) -> None:
@@ -113,7 +114,7 @@ class FixedLag:
             slam.engine.augment((KEPT, k), slam.engine.mean[:POSE].copy(), np.arange(POSE), np.eye(POSE))
 
     def keep(self, time_s: float, search: HeadingRelocalizer) -> None:
-        """Keep the pose of now where it is due, in place of the oldest one, which is what is known of it then."""
+        """If a copy is due, copy the current pose over the oldest copy, whose estimate is final then."""
         if self._times_s and time_s < self._times_s[-1] + self._spacing_s:
             return
         if len(self._times_s) >= self._count:
@@ -123,7 +124,7 @@ class FixedLag:
         self._times_s.append(time_s)
 
     def path(self, slam: BeaconSlam) -> DelayedPath:
-        """All of it, at the end."""
+        """The whole delayed path, at the end of the run."""
         while len(self._kept) < len(self._times_s):
             self._hand_over(slam)
         poses, covariances = zip(*self._kept, strict=True)
@@ -136,16 +137,15 @@ class FixedLag:
 
 KEPT = "kept"  # first part of the name of a block that holds the copy of a pose
 FINEST_S = 0.1
-# Mean square of normalised innovations, per degree of freedom, that is reported: of learned noise it is one.
-DOUBTFUL_NIS = 1.3
-DOUBTFUL_JUMPS = 0.003  # how often the pose has to be doubted, for each reading, that it is reported
-DOUBTFUL_SHARE = 0.05  # share of refused readings that is reported: twice that of ranges indoors
+DOUBTFUL_NIS = 1.3  # NIS per degree of freedom above which a warning is given: with learned noise it is one
+DOUBTFUL_JUMPS = 0.003  # pose jumps per reading above which a warning is given
+DOUBTFUL_SHARE = 0.05  # share of refused readings above which a warning is given: twice that of ranges indoors
 
 
 def filter_run(
     run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float]
 ) -> EstimatedPath:
-    """Run the filter over a recording; of the truth the first pose alone is used."""
+    """Run the filter over a recording; the first pose is the only part of the ground truth that is used."""
     return follow(run, cfg, how, clock_s)[0]
 
 
@@ -153,9 +153,9 @@ def follow(
     run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float],
     finest_s: float = FINEST_S, lag: FixedLagConfig | None = None,
 ) -> tuple[EstimatedPath, BeaconSlam]:  # fmt: skip
-    """The path by the filter, and the filter as it is at the end.
+    """The filter's path, and the filter at the end of the run.
 
-    ``finest_s``: steps of odometry shorter than that are put together.
+    ``finest_s``: steps of odometry within an interval of this length are combined, but cut at each reading.
     """
     sigmas = cfg.priors.pose_m, cfg.priors.pose_m, cfg.priors.heading_rad
     search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, np.diag(np.square(sigmas))))
@@ -182,28 +182,28 @@ def follow(
 
 
 class _Log:
-    """What the readings did, and how long it took: ``predict_s`` of each instant, the others of each reading, s."""
+    """Innovations and elapsed times, s: ``predict_s`` by instant, ``update_s`` by reading, ``scalar_s`` by scalar."""
 
     def __init__(self) -> None:
         self.learned, self.predict_s = list[BeaconInnovation](), list[float]()
         self.update_s, self.scalar_s = list[float](), list[float]()
 
     def take(self, learned: Sequence[BeaconInnovation], count: int, lasted_s: float) -> None:
-        """Take what ``count`` readings of the instant did."""
+        """Add the innovations of the ``count`` readings of an instant, which took ``lasted_s``."""
         self.learned += learned
         self.update_s += [(self.predict_s[-1] + lasted_s) / count] * count
-        if len(learned) == count:  # nothing that waits or joins: updates alone
+        if len(learned) == count:  # only updates: no reading waits, no beacon joins
             scalars = sum(one.size for one in learned)
             self.scalar_s += [lasted_s / scalars] * scalars
 
 
 def _result(run: RecordedRun, slam: BeaconSlam, log: _Log) -> EstimatedPath:
-    """All but the path, which is empty."""
+    """The result without the path, which is empty."""
     used = [one for one in log.learned if one.accepted]
     refused = len(log.learned) - len(used)
     nis, sizes = np.array([(one.nis, float(one.size)) for one in used]).reshape(-1, 2).T
     priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
-    # Those that the readings have determined in part; a prior is no result.
+    # Only values that the readings have determined at least in part.
     calibration = {
         name: Calibrated(*found) for name, found in slam.calibration.items() if found[1] < UNCHANGED * priors[name]
     }

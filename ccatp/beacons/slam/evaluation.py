@@ -1,4 +1,4 @@
-"""A track against the truth of its recording; the results of ``ccatp radio slam`` as data and text."""
+"""Errors of an estimated path and map against the ground truth; results of ``ccatp radio slam`` as data and text."""
 
 import math
 from collections.abc import Mapping
@@ -10,18 +10,18 @@ from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, 
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import Consistency, RigidMotion, best_motion, consistency, nees, rms, wrapped
 
-LONGEST_GAP_S = 0.5  # the truth is taken as known between two of its rows that lie no further apart,
-USUAL_GAPS = 3.0  # or no further than that many of its usual intervals
+LONGEST_GAP_S = 0.5  # the truth is interpolated over gaps up to this length,
+USUAL_GAPS = 3.0  # or up to this many of its median intervals
 
-FIRST_POSE_S = 1.0  # the truth's first row is the first pose if it comes no later than that
-LEAST_KNOWN = 3  # instants with a truth: one always fits, and two but for their distance
+FIRST_POSE_S = 1.0  # latest start of the truth after the odometry, for its first row to be the first pose
+LEAST_KNOWN = 3  # instants with a truth: an alignment fits one exactly, and two except for their distance
 
 
 class TrackEvaluation(NamedTuple):
     """Errors of a track; None where there is no truth.
 
-    ``nees``: of the poses as they are, without alignment; positions alone if the truth has no headings; None where the
-    first pose was not the truth's of that time.
+    ``nees``: of the poses without alignment; of positions alone if the truth has no headings; None if the first pose is
+    not that of the truth.
     """
 
     alignment: RigidMotion
@@ -37,8 +37,8 @@ class TrackEvaluation(NamedTuple):
 def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
     """Compare a track with the truth of the run.
 
-    One rigid motion without scale lays the positions on the truth; the beacons move with it. If only the beacons were
-    surveyed, they are aligned themselves.
+    One rigid motion without scale aligns the positions with the truth, and is applied to the beacons. If only the
+    beacons were surveyed, they are aligned themselves.
     """
     truth = np.full((len(track.times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, track.times_s)
     known = np.isfinite(truth[:, 0])
@@ -56,8 +56,8 @@ def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
     errors = np.hypot(*(alignment.moved(track.poses[:, :2]) - truth[:, :2]).T)
     headings = wrapped(track.poses[:, 2] + alignment.angle_rad - truth[:, 2])
     offsets = np.hypot(*(alignment.moved(places) - surveyed).T)
-    measurable = known.any() or len(common) > 2  # two points always fit
-    is_one_frame = False  # the truth gave the first pose: else track and truth are of two frames
+    measurable = known.any() or len(common) > 2  # an alignment of two points says nothing of their errors
+    is_one_frame = False  # True if the first pose came from the truth; otherwise the frames differ
     if run.truth is not None:
         start_s, end_s = run.truth.times_s[0] - FIRST_POSE_S, run.truth.times_s[-1]
         is_one_frame = bool(start_s <= run.steps.times_s[0] <= end_s)
@@ -74,7 +74,7 @@ def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
 
 
 def truth_at(truth: ReferencePath, times_s: FloatArray) -> FloatArray:
-    """True x_m, y_m, heading_rad at some times, shape (n, 3); NaN outside the truth and in its gaps."""
+    """True x_m, y_m, heading_rad at ``times_s``, shape (n, 3); NaN outside the truth and in its gaps."""
     columns = [np.interp(times_s, truth.times_s, column) for column in truth[1:]]
     after = np.searchsorted(truth.times_s, times_s).clip(1, len(truth.times_s) - 1)
     gap = truth.times_s[after] - truth.times_s[after - 1]
@@ -102,11 +102,11 @@ def _nees(track: EstimatedPath, truth: FloatArray, known: np.ndarray) -> Consist
     return consistency(squares, np.full(squares.size, float(size)))
 
 
-SCALES = ("range_scale", "distance_scale", "turn_scale")  # shown as factors: 1.07 for ranges that read 7 % too long
+SCALES = ("range_scale", "distance_scale", "turn_scale")  # shown as factors: 1.07 if ranges are 7 % too long
 
 
 def result_data(run: RecordedRun, filter_name: str, track: EstimatedPath, judged: TrackEvaluation) -> dict[str, Any]:
-    """The result as JSON has it; None where nothing is known."""
+    """The result for JSON; unknown values are None."""
     beacons = aligned_beacons(track, judged.alignment)
     calibration = {name: (value + (name in SCALES), sigma) for name, (value, sigma) in track.calibration.items()}
     nis, nees = judged.nis, judged.nees
@@ -150,7 +150,7 @@ def _delayed(run: RecordedRun, track: EstimatedPath) -> dict[str, float | None] 
 
 
 def table_lines(run: RecordedRun, data: dict[str, Any]) -> list[str]:
-    """The result for people."""
+    """The result as lines of text."""
     span_s = run.steps.times_s[-1] - run.steps.times_s[0]
     way_m = float(np.abs(run.steps.distance_m).sum())
     readings = f"{len(run.readings.times_s)} readings of {len(run.beacon_ids)} beacons"

@@ -1,4 +1,4 @@
-"""Readings of a beacon that is not on the map yet wait with copies of the poses where they were taken."""
+"""Initialisation of beacons: readings wait with copies of the poses where they were taken, until the place is known."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -14,58 +14,59 @@ from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
 
-# Kind, pose, calibration and states of the beacon to a row.
+# From kind, pose, calibration and states of the beacon to a row.
 RowOf = Callable[[str, list[float], list[float], list[float]], MeasurementRow]
 PriorAt = Callable[[float, float], BeaconEstimate]
 
-MOST = 24  # readings of a beacon that are kept; beyond, every other one goes, and they are taken twice as far apart
-LEAST = 8  # readings without which a beacon is not looked for: what its place needs, four times over
-SPACING = 0.01  # way between readings that are kept, at first, relative to the range
-STARTS = 24  # directions about the vehicle in which a beacon is looked for
+MOST = 24  # most readings of a beacon that are kept; above, every other one is dropped and the spacing is doubled
+LEAST = 8  # readings needed before a beacon without bearings is searched: four times the unknowns of its place
+SPACING = 0.01  # initial distance between kept readings, relative to the range
+STARTS = 24  # directions about the vehicle in which a beacon is searched
 TIGHT = 0.1  # largest standard deviation, across the line of sight, of a beacon that joins, relative to its distance
-# How many times that is borne at last, in proportion to the readings: the vehicle strays while beacons wait.
+# Largest factor on TIGHT and BEND, which grow with the number of readings: odometry drifts while beacons wait.
 LOOSEST = 2.5
-# Largest second-order change of a waiting reading, in its sigmas, over the spread of the place across its line of
-# sight: seen from near by, the arc on which a far beacon may lie is no Gaussian.
+# Largest second-order change of a waiting reading, in its sigmas, over one standard deviation of the place across its
+# line of sight: from nearby, the arc on which a far beacon may lie is not Gaussian.
 BEND = 1.0
-DEEP = 0.3  # the same along it, where ranges are all but linear: a scale that all share may be that uncertain
-APART = 0.05  # places nearer to each other than that, relative to the distance, are one
-# Residuals beyond that many sigmas first weigh no more than those at it (Huber), at last nothing: readings round a
-# corner are too long. Each then costs what one at the knee does, so that places can be compared.
+DEEP = 0.3  # as TIGHT, along the line of sight, where ranges are almost linear: a shared scale may be that uncertain
+APART = 0.05  # candidates closer together than this, relative to the distance, are the same
+# Residuals beyond this many sigmas first get Huber's weight and finally none: ranges by reflection are too long. Each
+# reading that is left out costs as much as one at the limit, so that candidates can be compared.
 KNEE = 3.0
 MEDIAN_TO_SIGMA = 1.4826  # standard deviation of a Gaussian over the median of its absolute value
-OUT = 100.0  # what a residual squared is taken times for the variance of a reading that is left out
-PLAIN, ROBUST, ITERATIONS = 3, 7, 14  # steps of Gauss-Newton without weights, until those of Huber end, and at most
-# How much worse the second best place must be, chi-squared, so that the best is no mirror image: odds of a thousand
-# to one, though two readings were off.
+OUT = 100.0  # a reading that is left out gets its squared residual times this as variance
+PLAIN, ROBUST, ITERATIONS = 3, 7, 14  # Gauss-Newton: step where Huber's weights begin, where they end, most steps
+# Smallest excess of the second candidate's chi-squared over the best one's, so that the best is no mirror image: odds
+# of a thousand to one, even with two outliers.
 MARGIN = 14.0 + 2.0 * KNEE**2
-# Sigmas by which chi-squared may exceed its expectation; if it stays beyond, the noise is taken for that much larger
-# (Birge's ratio): with less noise in the settings than there is, no beacon would ever join.
+# Sigmas by which chi-squared may exceed its expectation; after MOST readings it may exceed more. The noise is increased
+# by chi-squared over its degrees of freedom (Birge's ratio). Otherwise, with too small a noise in the settings, no
+# beacon would ever join.
 FIT = 6.0
-LINEARISATIONS = 8  # at most; Gauss-Newton on readings that a beacon joined by comes to rest within five
-TRIAL = 2  # readings that must agree with the one that a beacon joined by: a misread name would put it anywhere
+LINEARISATIONS = 8  # largest number; Gauss-Newton converges within five
+TRIAL = 2  # number of readings that must agree with the first one: a misread name would give any place
 
 
 class ReadingRecord(NamedTuple):
     """A reading that waits."""
 
     reading: Reading
-    place: BlockId  # of the state: the place (x_m, y_m) where it was taken, or the pose if there is a bearing
+    place: BlockId  # block of the state: the place (x_m, y_m) where it was taken, or the pose if there is a bearing
     distance_m: float
 
 
 class Candidate(NamedTuple):
-    """A place where a beacon may be."""
+    """A possible place of a beacon."""
 
     mean: FloatArray  # states of the beacon, shape (b,)
     covariance: FloatArray  # shape (b, b)
-    cost: float
-    variances: FloatArray  # of the readings' noise, larger where they look too far off, shape (m,)
-    bend: float  # most that a reading changes in second order over a sigma across its line of sight, in sigmas
+    cost: float  # chi-squared of the readings, with the cost of those that were left out
+    variances: FloatArray  # of the readings' noise, increased for large residuals, shape (m,)
+    bend: float  # largest second-order change of a reading over a sigma across its line of sight, in sigmas
 
 
 class StackedRows:
-    """All scalars of waiting readings of one beacon, over the poses that wait with them and the calibration."""
+    """All scalars of the waiting readings of one beacon, as functions of their poses and the calibration."""
 
     def __init__(self, engine: EkfSlam, records: Sequence[ReadingRecord], shared: slice, row_of: RowOf) -> None:
         self.blocks = [engine.block(record.place) for record in records]
@@ -80,7 +81,7 @@ class StackedRows:
         self.size, self._shared_start = len(self._scalars), starts[-1]
 
     def at(self, x: FloatArray, beacon: list[float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """At a state x (n,): derivatives by ``columns`` (m, k) and the beacon (m, b), z - h and variances (m,)."""
+        """At a state x (n,): derivatives by ``columns`` (m, k) and by the beacon (m, b), z - h (m,), variances (m,)."""
         m, calibration, first = self.size, x[self._shared].tolist(), self._shared_start
         H, G, e, R = np.zeros((m, self.columns.size)), np.zeros((m, len(beacon))), np.zeros(m), np.zeros(m)
         for i, (kind, z, block, start) in enumerate(self._scalars):
@@ -98,10 +99,9 @@ class StackedRows:
 class PendingLandmark:
     """Readings of a beacon that is not on the map yet.
 
-    The vehicle's pose at each of them is kept in the state as a clone (Mourikis and Roumeliotis 2007), so that what
-    they say of the beacon comes with the right correlations, however long they wait. With H the derivatives by clones
-    and calibration, S = H P H^T + R, each candidate minimises e^T S^-1 e. ``candidates``: where it may be, best first;
-    two as long as a mirror image is possible.
+    The vehicle's pose at each of them is kept in the state as a clone (Mourikis and Roumeliotis 2007), so the
+    correlations are right, however long the readings wait. With H the derivatives by clones and calibration, and
+    S = H P H^T + R, each candidate minimises e^T S^-1 e. ``candidates``: possible places, best first, at most two.
     """
 
     beacon: BeaconId
@@ -111,7 +111,7 @@ class PendingLandmark:
     count: int = 0
 
     def is_apart(self, engine: EkfSlam, place: Sequence[float], range_m: float) -> bool:
-        """Whether the vehicle has moved to a place since the last reading that was kept."""
+        """Whether a place is at least the spacing away from the last reading that was kept."""
         if not self.records:
             self.spacing_m = SPACING * range_m
             return True
@@ -119,25 +119,25 @@ class PendingLandmark:
         return hypot(place[0] - last_x, place[1] - last_y) >= self.spacing_m
 
     def take(self, engine: EkfSlam, record: ReadingRecord, pose: FloatArray, columns: Columns, J: FloatArray) -> None:
-        """Keep a reading with a copy of the pose (2,) or (3,), and its derivatives (2 or 3, k) by some columns."""
+        """Keep a reading with a copy of the place (2,) or pose (3,) and its derivatives by ``columns``, (2 or 3, k)."""
         self.count += 1
         engine.augment(record.place, pose, columns, J)
         self.records.append(record)
 
     def thin(self, engine: EkfSlam) -> None:
-        """Drop every other reading where there are too many."""
+        """If there are more than MOST readings, drop every other one."""
         if len(self.records) > MOST:
             self.spacing_m *= 2.0
             engine.remove(*(record.place for record in self.records[1::2]))
             self.records = self.records[::2]
 
     def drop(self, engine: EkfSlam) -> None:
-        """Forget the readings."""
+        """Remove all readings and their clones."""
         engine.remove(*(record.place for record in self.records))
         self.records = []
 
     def look(self, engine: EkfSlam, rows: StackedRows, prior_at: PriorAt) -> None:
-        """Look for the beacon: sets ``candidates``."""
+        """Search the beacon: sets ``candidates``."""
         reach_m, pointed = self.records[-1].distance_m, self.pointed(engine)
         problem = _Problem(
             engine.mean.copy(), engine.covariance[np.ix_(rows.columns, rows.columns)], rows, reach_m, pointed is None
@@ -150,7 +150,7 @@ class PendingLandmark:
             self.candidates = [] if likely is None else [likely]
             return
         starts = [BeaconEstimate(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
-        # The last distance may have gone round a corner: the usual one is tried, too.
+        # The last range may be a reflection: the median is tried, too.
         for radius_m in {reach_m, median([record.distance_m for record in self.records])}:
             starts = [*problem.around(prior_at, places[-1], radius_m), *starts]
         found = [candidate for candidate in map(problem.refine, starts) if candidate is not None]
@@ -166,7 +166,7 @@ class PendingLandmark:
         self.candidates = apart[:2]
 
     def pointed(self, engine: EkfSlam) -> tuple[float, float] | None:
-        """Where the first reading with a bearing points, as far as it reaches; None where there is no such reading."""
+        """Place given by bearing and distance of the first reading with a bearing; None if there is no such reading."""
         for reading, place, distance_m in self.records:
             if reading.bearing_rad is not None:
                 x, y, heading = engine.mean[engine.block(place)].tolist()
@@ -175,7 +175,7 @@ class PendingLandmark:
         return None
 
     def found(self, engine: EkfSlam) -> Candidate | None:
-        """The beacon's place, if there is only one, well enough known to be linearised at, and the readings agree."""
+        """The best candidate with the variances to use; None unless it is unique, accurate and fits the readings."""
         if not self.candidates:
             return None
         best = self.candidates[0]
@@ -200,15 +200,15 @@ class PendingLandmark:
 
 class _Problem(NamedTuple):
     x: FloatArray
-    P: FloatArray  # of the columns of the rows
+    P: FloatArray  # covariance of ``rows.columns``, shape (k, k)
     rows: StackedRows
     reach_m: float
-    is_robust: bool  # ranges that went round a corner are left out; a bearing decides between two places
+    is_robust: bool  # outliers are left out; False if a bearing determines the place
 
     def around(self, prior_at: PriorAt, place: Sequence[float], radius_m: float) -> list[BeaconEstimate]:
-        """Where to begin: the best directions on a circle about the last place, poses and calibration as they are.
+        """Initial places: local minima of the cost on a circle about the last place, with poses and calibration fixed.
 
-        A reading that is off counts little (Cauchy).
+        The cost is Cauchy's, so outliers have little weight.
         """
         angles = [2.0 * pi * k / STARTS for k in range(STARTS)]
         ring = [prior_at(place[0] + radius_m * cos(angle), place[1] + radius_m * sin(angle)) for angle in angles]
@@ -219,7 +219,7 @@ class _Problem(NamedTuple):
         return [ring[k] for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
 
     def refine(self, prior: BeaconEstimate, start: FloatArray | None = None) -> Candidate | None:
-        """Gauss-Newton from the prior's mean, or from a better place."""
+        """Gauss-Newton from ``start``, or from the prior's mean; None if it diverges."""
         b, W, stride = prior.mean if start is None else start, np.linalg.inv(prior.covariance), 0.5 * self.reach_m
         variances, A, cost = b, W, inf
         for k in range(ITERATIONS):
@@ -248,7 +248,7 @@ class _Problem(NamedTuple):
 
 
 def _mirrored(places: FloatArray, point: FloatArray) -> tuple[float, float]:
-    """The image of a point (2,) on the other side of the way (m, 2), which ranges distinguish last."""
+    """Mirror image of a point (2,) in the principal axis of the places (m, 2): ranges hardly distinguish the two."""
     middle = places.mean(axis=0)
     along = np.linalg.svd(places - middle)[2][0]
     x, y = middle + 2.0 * along * along.dot(point - middle) - (point - middle)
@@ -256,17 +256,16 @@ def _mirrored(places: FloatArray, point: FloatArray) -> tuple[float, float]:
 
 
 def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[FloatArray, float]:
-    """Variances of the readings at a step of the iteration, and what those that are left out cost.
+    """Variances of the readings at a step of the iteration, (m,), and the cost of those that are left out.
 
-    ``e``: residuals, shape (m,). ``S``: their variances by all that is unknown, shape (m,). ``R``: those of the
-    readings, shape (m,).
+    ``e``: residuals, shape (m,). ``S``: innovation variances, shape (m,). ``R``: variances of the readings, shape (m,).
     """
     if step < PLAIN:
         return R, 0.0
     sigmas = np.abs(e) / np.sqrt(S)
     if step < ROBUST:
         return R + S * np.maximum(sigmas / KNEE - 1.0, 0.0), 0.0
-    # by the usual residual, not by the noise that was promised: or a bad place could leave out what speaks against it
+    # relative to the median residual, not to the configured noise: a wrong place must not leave out all that contradict
     limit = KNEE * max(1.0, MEDIAN_TO_SIGMA * float(np.median(sigmas)))
     is_out = sigmas > limit
     return R + np.where(is_out, OUT * e * e, 0.0), limit**2 * float(is_out.sum())

@@ -1,4 +1,4 @@
-"""A position from one level of each beacon: the posterior over a room, its mean and its regions."""
+"""Position from one signal level of each beacon: the posterior over a room, its mean and its regions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,23 +12,23 @@ import numpy.typing as npt
 from ccatp.beacons.slam.path_loss import LevelPair, PathLossFit, fit_path_loss
 from ccatp.core import FloatArray
 
-_NEAREST_M = 0.1  # nearer than this the log-distance model is not believed
+_NEAREST_M = 0.1  # smallest distance for which the log-distance model is used
 _MOST_PERMUTED = 5  # names: 120 permutations
 
 
 class MeasuredPlace(NamedTuple):
-    """A known place, and the levels received there by beacon."""
+    """A known place, and the level of each beacon received there."""
 
     place_m: tuple[float, float]
     levels_dbm: dict[str, float]
 
     def renamed(self, names: Mapping[str, str]) -> "MeasuredPlace":
-        """With other names of beacons, from old to new."""
+        """A copy with renamed beacons; ``names``: from old to new."""
         return MeasuredPlace(self.place_m, {names.get(name, name): level for name, level in self.levels_dbm.items()})
 
 
 def grid_points(low_m: tuple[float, float], high_m: tuple[float, float], spacing_m: float) -> FloatArray:
-    """Points of a grid over a rectangle, the outermost on its sides, shape (n, 2)."""
+    """Points of a grid over a rectangle, the outermost ones on its sides, shape (n, 2)."""
     axes = [
         np.linspace(low, high, max(2, round((high - low) / spacing_m) + 1))
         for low, high in zip(low_m, high_m, strict=True)
@@ -38,7 +38,7 @@ def grid_points(low_m: tuple[float, float], high_m: tuple[float, float], spacing
 
 @dataclass(frozen=True, slots=True)
 class LevelFix:
-    """A position."""
+    """A position with its posterior on a grid."""
 
     position_m: FloatArray  # mean of the posterior, shape (2,)
     covariance_m2: FloatArray  # of the posterior, shape (2, 2)
@@ -46,7 +46,7 @@ class LevelFix:
     weights: FloatArray  # posterior of the grid points, shape (n,)
 
     def region(self, probability: float) -> npt.NDArray[np.bool_]:
-        """The grid points of the smallest region that holds a probability, as a mask of shape (n,)."""
+        """Grid points of the smallest region that contains a probability, as a mask of shape (n,)."""
         order = np.argsort(-self.weights)
         before = np.cumsum(self.weights[order]) - self.weights[order]
         mask = np.zeros(self.weights.size, dtype=np.bool_)
@@ -54,17 +54,17 @@ class LevelFix:
         return mask
 
     def holds(self, place_m: Sequence[float], probability: float) -> bool:
-        """Whether the smallest region of a probability holds a place."""
+        """Whether the smallest region of a probability contains the grid point nearest to a place."""
         nearest = int(np.argmin(np.hypot(*(self.points_m - np.asarray(place_m)).T)))
         return bool(self.region(probability)[nearest])
 
 
 class LevelLocator:
-    """Positions from levels of beacons whose places and path losses are known.
+    """Positions from levels of beacons with known places and path losses.
 
-    The level of a beacon at a place has Student's t about its path loss: the spread of its calibration, and the
-    uncertainty of the two parameters. Over the room all places are as likely; the posterior is summed on the points of
-    a grid, shape (n, 2), so that nothing is linearised. Its mean is the position of least expected squared error.
+    The level of a beacon at a place has Student's t about its path loss, with the spread of the calibration and the
+    uncertainty of its two parameters. The prior is uniform over the room. The posterior is computed on the points of a
+    grid, shape (n, 2), without linearisation. Its mean has the least expected squared error.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class LevelLocator:
         self._predicted = [self._predict(self.points_m, i) for i in range(len(self.names))]
 
     def fix(self, levels_dbm: Mapping[str, float]) -> LevelFix:
-        """The position of a receiver of these levels; beacons without a level are left out.
+        """Position of the receiver of these levels; beacons without a level are ignored.
 
         Raises ValueError: there is no level.
         """
@@ -94,7 +94,7 @@ class LevelLocator:
         return LevelFix(mean, (off * weights[:, None]).T @ off, self.points_m, weights)
 
     def log_likelihood(self, place_m: Sequence[float], levels_dbm: Mapping[str, float]) -> float:
-        """Of levels at a known place."""
+        """Log-likelihood of levels at a known place, up to a constant."""
         at = np.asarray(place_m, dtype=np.float64)[None, :]
         return sum(
             float(_log_density(levels_dbm[name], *self._predict(at, i), self._fits[i].freedom)[0])
@@ -108,10 +108,10 @@ class LevelLocator:
 
 
 def likeliest_names(locator: LevelLocator, places: Sequence[MeasuredPlace]) -> tuple[dict[str, str], float]:
-    """Which names the beacons of a data set with known places should have.
+    """The likeliest names of the beacons in a data set with known places.
 
     Returns the likeliest permutation, from the name in the data to the beacon's, and how much its log-likelihood
-    exceeds that of the names as they are.
+    exceeds that of the unchanged names. With more than five beacons the names are not changed.
     """
     names = locator.names
     if len(names) > _MOST_PERMUTED:
@@ -128,9 +128,9 @@ def likeliest_names(locator: LevelLocator, places: Sequence[MeasuredPlace]) -> t
 def fingerprint_fits(
     places: Sequence[MeasuredPlace], beacons_m: Mapping[str, tuple[float, float]], left_out: int | None = None
 ) -> dict[str, PathLossFit]:
-    """Path loss of each beacon from its levels at known places, but for one of them.
+    """Path loss of each beacon from its levels at known places; ``left_out``: index of a place that is not used.
 
-    Raises PathLossError: no path loss follows from them.
+    Raises PathLossError: no path loss can be fitted.
     """
     used = [place for index, place in enumerate(places) if index != left_out]
     found = {}
@@ -145,7 +145,7 @@ def fingerprint_fits(
 
 
 def judged(fixes: Sequence[LevelFix], places: Sequence[MeasuredPlace], probability: float) -> dict[str, Any]:
-    """Errors of fixes, and how many of the places their regions of a probability hold, for JSON."""
+    """Errors of fixes, and how many regions of a probability contain the true place, for JSON."""
     points: list[dict[str, Any]] = []
     for found, place in zip(fixes, places, strict=True):
         error_m, sigmas_m = float(np.hypot(*(found.position_m - place.place_m))), np.sqrt(np.diag(found.covariance_m2))

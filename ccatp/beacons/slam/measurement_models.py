@@ -1,6 +1,7 @@
-"""What a reading of a beacon should be, with its derivatives: ranges, bearings, signal strengths.
+"""Measurement models with their derivatives: ranges, bearings, signal strengths.
 
-``range_row``, ``bearing_row`` and ``level_row`` compute one reading with ``math`` and all of a run with ``numpy``.
+``range_row``, ``bearing_row`` and ``level_row`` compute one reading with ``math``, or all readings of a run with
+``numpy``.
 """
 
 import math
@@ -24,7 +25,7 @@ NEAREST_M2 = 1e-6  # added to squared distances: at a beacon a range has no dire
 
 
 def range_row(xp: ModuleType, dx: Any, dy: Any, scale: Any) -> tuple[Any, Any, Any, Any]:
-    """Of the way (dx, dy) to a beacon: (1 + e) r, its derivatives by dx and dy, and r, that by the scale."""
+    """(1 + e) r of the vector (dx, dy) to a beacon, its derivatives by dx, dy and e; ``scale`` is 1 + e."""
     r = xp.sqrt(dx * dx + dy * dy + NEAREST_M2)
     return scale * r, scale * dx / r, scale * dy / r, r
 
@@ -43,7 +44,7 @@ def level_row(xp: ModuleType, dx: Any, dy: Any, reference: Any, exponent: Any) -
 
 
 def range_variance(radio: RadioNoiseConfig, range_m: Any) -> Any:
-    """Of a range, m^2: sigma^2 + sigma_per_m^2 r^2."""
+    """Variance of a range, m^2: sigma^2 + sigma_per_m^2 r^2."""
     return radio.range_sigma_m**2 + radio.range_sigma_per_m**2 * range_m * range_m
 
 
@@ -51,28 +52,28 @@ class MeasurementRow(msgspec.Struct, gc=False):
     """One scalar of a reading."""
 
     expected: float  # h(x), in the reading's unit
-    pose: tuple[float, float, float]  # dh by x_m, y_m and heading_rad of the vehicle
-    calibration: tuple[float, ...]  # dh by what all readings share, as far as it is estimated
-    beacon: tuple[float, ...]
+    pose: tuple[float, float, float]  # derivatives of h by x_m, y_m and heading_rad of the vehicle
+    calibration: tuple[float, ...]  # derivatives by the estimated calibration that all readings share
+    beacon: tuple[float, ...]  # derivatives by the states of the beacon
     variance: float
 
 
 class MeasurementModel(ABC):
-    """One kind of reading. ``extra_prior``: mean and standard deviation of the states of a beacon behind x and y."""
+    """One kind of reading. ``extra_prior``: mean and standard deviation of a beacon's states after x and y."""
 
     extra_prior: tuple[tuple[float, float], ...] = ()
 
     @abstractmethod
     def row(self, pose: list[float], calibration: list[float], beacon: list[float], name: BeaconId) -> MeasurementRow:
-        """What is expected at a state."""
+        """Expected value, derivatives and noise variance at a state."""
 
     def distance_m(self, z: float, _name: BeaconId) -> float:
-        """What a reading says of the distance alone."""
+        """Distance that corresponds to a reading."""
         return max(z, 1e-3)
 
 
 class RangeModel(MeasurementModel):
-    """z = (1 + e) r + o, scale e and offset o shared by all, each estimated where its prior is not zero."""
+    """z = (1 + e) r + o, with scale e and offset o shared by all beacons, each estimated if its prior is not zero."""
 
     def __init__(self, radio: RadioNoiseConfig, priors: PriorsConfig) -> None:
         self._radio = radio
@@ -108,8 +109,8 @@ class BearingModel(MeasurementModel):
 class LevelModel(MeasurementModel):
     """z = P_ref - 10 eta log10(r / 1 m) + b (Hevrdejs and Knoll 2017, eq. 4; Auth and Hovey 2018, eq. 2.3).
 
-    States of each beacon behind x and y: P_ref and eta, each where its prior is not zero, and the values of the
-    static shadowing b, where there is a map of it.
+    States of each beacon after x and y: P_ref and eta, each if its prior is not zero, and the states of the
+    static shadowing b, if there is a map of it.
     """
 
     def __init__(
@@ -142,17 +143,18 @@ class LevelModel(MeasurementModel):
         return MeasurementRow(expected, (-gx, -gy, 0.0), self._shared, (gx, gy, *tail), variance)
 
     def distance_m(self, z: float, name: BeaconId) -> float:
-        """Half of such distances are too long."""
+        """Median distance for a level: half of such distances are too long."""
         return self._loss_of(name).median_range_m(z)
 
 
 class ShadowingMap:
     """Kriging of a Gaussian field with covariance sigma^2 exp(-d / L) (Gudmundson 1991) from its values at grid points.
 
-    The field at a place is k^T C^-1 f + rest, with f the values at the points, C their covariance, k the covariances
-    between place and points; the rest has the variance sigma^2 - k^T C^-1 k and counts as white. The states are w =
-    R^-1 f with C = R R^T, so that a prior of them is the identity, and the row of a place is k^T R^-T. ``spacing_m``:
-    between grid points; the outermost lie on the walls. ``sigma_db``: sigma.
+    The field at a place is k^T C^-1 f + rest, with f the values at the points, C their covariance, and k the
+    covariances between place and points. The rest has the variance sigma^2 - k^T C^-1 k and is treated as white noise.
+    The states are w = R^-1 f with C = R R^T, so their prior covariance is the identity, and the row of a place is
+    k^T R^-T. ``spacing_m``: between grid points; the outermost ones lie on the walls. ``sigma_db``: sigma.
+    ``length_m``: L.
     """
 
     def __init__(self, size_m: tuple[float, float], spacing_m: float, sigma_db: float, length_m: float) -> None:
@@ -164,11 +166,11 @@ class ShadowingMap:
 
     @property
     def size(self) -> int:
-        """How many states it takes."""
+        """Number of states."""
         return len(self._points)
 
     def row(self, x_m: float, y_m: float) -> tuple[FloatArray, float]:
-        """Derivatives of the field at a place by the states, shape (size,), and the variance of the rest, dB^2."""
+        """Derivatives of the field at a place by the states, shape (size,), and variance of the rest, dB^2."""
         row = self._inverse_root @ self._covariance(np.hypot(*(self._points - (x_m, y_m)).T))
         return row, max(self._variance - float(row @ row), 0.0)
 
@@ -177,15 +179,15 @@ class ShadowingMap:
 
 
 class MeasurementModels(NamedTuple):
-    """The models by kind of reading, and what they share."""
+    """The models by kind of reading, and their shared calibration."""
 
     by_kind: Mapping[str, MeasurementModel]
-    names: tuple[str, ...] = ()  # calibration that is estimated
+    names: tuple[str, ...] = ()  # of the estimated calibration
     prior_sigmas: tuple[float, ...] = ()
 
 
 def recorded_models(radio: RadioNoiseConfig, priors: PriorsConfig) -> MeasurementModels:
-    """Of a recorded run: levels of beacons of their own, where the priors leave them open."""
+    """Models for a recorded run; P_ref and exponent are estimated for each beacon if their priors are not zero."""
     ranges = RangeModel(radio, priors)
     shared = len(ranges.names)
     loss = PathLoss(radio.rssi_reference_dbm, radio.rssi_exponent, radio.rssi_sigma_db)
@@ -200,12 +202,12 @@ def recorded_models(radio: RadioNoiseConfig, priors: PriorsConfig) -> Measuremen
 
 
 def is_direction(reading: Reading) -> bool:
-    """Whether it has a bearing and nothing else."""
+    """Whether the reading has neither range nor signal strength."""
     return math.isnan(reading.range_m) and math.isnan(reading.rssi_dbm)
 
 
 def scalars_of(reading: Reading) -> list[tuple[str, float]]:
-    """The numbers of a reading, each with its kind: the bearing, then the range or the signal strength."""
+    """Values of a reading, each with its kind: the bearing, then the range, then the signal strength, if present."""
     found = [] if reading.bearing_rad is None else [("bearing", reading.bearing_rad)]
     if not math.isnan(reading.range_m):
         found.append(("range", reading.range_m))

@@ -1,4 +1,4 @@
-"""How a vehicle moves between two readings, with Jacobian and noise; where it was at the time of a reading."""
+"""Motion models of a vehicle with Jacobian and noise; its pose at the time of a reading."""
 
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ SMALL_RAD = 1e-3  # half a turn below which sin(a) / a is 1 - a^2 / 6 to the las
 
 
 class VehiclePose(NamedTuple):
-    """Where a vehicle stands; the heading is continuous, it does not wrap."""
+    """Pose of a vehicle; the heading is continuous, it does not wrap."""
 
     x_m: float
     y_m: float
@@ -30,15 +30,15 @@ class VehiclePose(NamedTuple):
 
 
 class Increment(NamedTuple):
-    """Odometry of an interval: what the wheels, or wheels and gyroscope, say was travelled."""
+    """Odometry of an interval, by wheels or by wheels and gyroscope."""
 
     time_s: float
     interval_s: float
     distance_m: float
     turn_rad: float
     lateral_m: float = 0.0  # to the left; zero for wheels that do not slip
-    guess_m2: float = 0.0  # variance of x and of y at its end, because the odometry was silent and the way is guessed
-    guess_rad2: float = 0.0
+    guess_m2: float = 0.0  # variance of x and of y at its end, if the odometry was missing and the motion is guessed
+    guess_rad2: float = 0.0  # variance of the heading, in the same case
 
 
 class Steering(NamedTuple):
@@ -57,8 +57,8 @@ class MotionStep(NamedTuple):
     """A prediction of the vehicle's states."""
 
     mean: FloatArray  # shape (v,)
-    F: FloatArray  # d(mean)/d(states before), shape (v, v); work space, as Q: it holds until the next step
-    Q: FloatArray  # covariance of what the odometry does not say, shape (v, v)
+    F: FloatArray  # d(mean)/d(previous states), shape (v, v); the next step may overwrite F and Q
+    Q: FloatArray  # covariance of the motion noise, shape (v, v)
 
 
 def estimated(priors: Mapping[str, float]) -> tuple[tuple[str, ...], tuple[float, ...]]:
@@ -68,12 +68,12 @@ def estimated(priors: Mapping[str, float]) -> tuple[tuple[str, ...], tuple[float
 
 
 def turned_way(distance_m: Any, turn_rad: Any) -> Any:
-    """|w_o| sign(d_o), rad, of one step or of arrays (n,): what ``distance_per_rad`` is multiplied by."""
+    """|w_o| sign(d_o), rad, of one step or of arrays (n,): the factor of ``distance_per_rad``."""
     return abs(turn_rad) * (1.0 * (distance_m > 0.0) - (distance_m < 0.0))
 
 
 def step_variances(noise: OdometryNoiseConfig, way_m: Any, turned_rad: Any, interval_s: Any) -> tuple[Any, Any, Any]:
-    """Of way, turn and way to the left, by how much was driven and turned; of one step or of arrays (n,)."""
+    """Variances of distance, turn and lateral distance of one step or of arrays (n,)."""
     var_turn = noise.turn_per_sqrt_m**2 * way_m + noise.turn_per_sqrt_rad**2 * turned_rad
     return (
         noise.distance_per_sqrt_m**2 * way_m + noise.distance_per_sqrt_rad**2 * turned_rad,
@@ -89,18 +89,18 @@ def _increment(odometry: Odometry) -> Increment:
 
 
 class DifferentialDrive:
-    """Odometry by increments: the chord of a circular arc (thesis eq. 2.14 as it is meant).
+    """Odometry by increments: the chord of a circular arc (thesis eq. 2.14, corrected).
 
-    With the corrected way d = d_o / (1 + e_d) - l_w |w_o| sign(d_o) and turn w = w_o / (1 + e_w) - b dt,
-    m = heading + w / 2 and c = sin(w / 2) / (w / 2):
+    With the corrected distance d = d_o / (1 + e_d) - l_w |w_o| sign(d_o), lateral distance l = l_o / (1 + e_d) and turn
+    w = w_o / (1 + e_w) - b dt, m = heading + w / 2 and c = sin(w / 2) / (w / 2):
 
         x <- x + c d cos(m) - l sin(m),  y <- y + c d sin(m) + l cos(m),  heading <- heading + w
 
-    States behind the pose, each where its prior is not zero: turn_bias_rad_s (b), turn_scale (e_w), distance_scale
-    (e_d), distance_per_rad (l_w): positive where the odometry reads too much; l_w is the way that a vehicle loses by
-    turning while it drives, as one does that is commanded. At rest, where the odometry is slower than
-    ``rest_speed_m_s`` and ``rest_turn_rad_s``, the turn is nothing but the bias: the heading stays. All noise is a
-    random walk, so variances grow with the way and the time.
+    States after the pose, each if its prior is not zero: turn_bias_rad_s (b), turn_scale (e_w), distance_scale (e_d),
+    distance_per_rad (l_w). They are positive if the odometry reads too much; l_w is the distance that a vehicle loses
+    by turning while it drives, if commands are used as odometry. At rest, below ``rest_speed_m_s`` and
+    ``rest_turn_rad_s``, the measured turn is only the bias, and the heading is constant (if a bias is estimated). All
+    noise is a random walk, so variances grow with distance, turn and time.
     """
 
     def __init__(self, noise: OdometryNoiseConfig, priors: PriorsConfig, how: SlamFilterConfig) -> None:
@@ -113,7 +113,7 @@ class DifferentialDrive:
         self._F, self._Q = np.eye(size), np.zeros((size, size))
 
     def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
-        """The states, shape (v,), after the interval. Raises TypeError: the odometry is of a steered vehicle."""
+        """Predict the states, shape (v,). Raises TypeError: the odometry is of a steered vehicle."""
         odometry = _increment(odometry)
         values: list[float] = states.tolist()
         scaled = 1.0 + values[self._way_scale] if self._way_scale >= 0 else 1.0
@@ -127,7 +127,7 @@ class DifferentialDrive:
         d_chord = -half / 3.0 if abs(half) < SMALL_RAD else (cos(half) - chord) / half
         c, s = cos(values[2] + half), sin(values[2] + half)
         dx, dy = chord * way * c - side * s, chord * way * s + side * c
-        # by the turn: half of what the heading does, and half of what the chord loses
+        # derivatives of the position by the turn: through the mean heading (half the turn) and the chord
         x_turn, y_turn = 0.5 * (d_chord * way * c - dy), 0.5 * (d_chord * way * s + dx)
         mean, F = states.copy(), self._F
         mean[0], mean[1], mean[2] = values[0] + dx, values[1] + dy, values[2] + turn
@@ -144,9 +144,9 @@ class DifferentialDrive:
         return MotionStep(mean, F, Q)
 
     def at_rest(self, odometry: Odometry) -> tuple[int, float, float] | None:
-        """Column, value and variance of the bias, which is the turn read at rest; None while the vehicle drives.
+        """Column, value and variance of a measurement of the bias by the turn at rest; None while the vehicle drives.
 
-        Its noise is the gyroscope's angle random walk.
+        The noise is the gyroscope's angle random walk.
         """
         if self._bias < 0 or not isinstance(odometry, Increment) or not self._rests(odometry):
             return None
@@ -187,13 +187,13 @@ class DifferentialDrive:
 class SlippingVehicle:
     """A steered vehicle (Hevrdejs and Knoll 2017, eq. 3) or a differential drive, with slip s and drift b.
 
-    With the way d = T v (1 - s), x <- x + d cos(h + a), y <- y + d sin(h + a), h <- h + w:
+    With the distance d = T v (1 - s), x <- x + d cos(h + a), y <- y + d sin(h + a), h <- h + w:
 
-    * steered by g: a = g, w = d sin(g) / l + T b
-    * differential at the rate omega: w = T omega (1 - s) + T b, a = w / 2
+    * steered by the angle g, wheelbase l: a = g, w = d sin(g) / l + T b
+    * differential at the turn rate omega: w = T omega (1 - s) + T b, a = w / 2
 
-    States behind the pose: heading_drift_rad_s (b) and slip (s), each where its prior is not zero. Wheels that read
-    zero stand, and have no noise.
+    States after the pose: heading_drift_rad_s (b) and slip (s), each if its prior is not zero. If the wheels read zero,
+    the vehicle stands, without noise.
 
     An ``ackermann`` vehicle takes ``Steering``, a ``differential`` one ``Increment``.
     """
@@ -211,15 +211,12 @@ class SlippingVehicle:
         self.size = POSE + len(self.names)
 
     def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
-        """The states, shape (v,), after the interval.
-
-        Raises TypeError: the odometry is of the other kind of vehicle.
-        """
+        """Predict the states, shape (v,). Raises TypeError: the odometry is of the other kind of vehicle."""
         T, v, reading = self._read(odometry)
         values: list[float] = states.tolist()
         drift = 0.0 if self._drift is None else values[self._drift]
         slip = 0.0 if self._slip is None else values[self._slip]
-        # Derivatives of swing and turn are by the reading of steering or turn rate, speed or drift, and slip.
+        # ``reading``: steering angle or turn rate. ``swing``: angle from the old heading to the direction of motion.
         if self._is_steered:
             curve = T * sin(reading) / self._wheelbase_m
             swing, turn = reading, curve * v * (1.0 - slip) + T * drift
@@ -249,7 +246,7 @@ class SlippingVehicle:
         return MotionStep(mean, F, L @ L.T)
 
     def at_rest(self, _odometry: Odometry) -> None:
-        """Standing still shows nothing of drift or slip."""
+        """None: rest gives no information about drift or slip."""
 
     def _read(self, odometry: Odometry) -> tuple[float, float, float]:
         if self._is_steered:
@@ -260,7 +257,7 @@ class SlippingVehicle:
         return T, odometry.distance_m / T, odometry.turn_rad / T
 
 
-SLIVER = 0.2  # part of an interval that is not worth a step of its own: the pose is carried over it
+SLIVER = 0.2  # a step is not divided into a part shorter than this share: the pose is extrapolated instead
 
 
 class CarriedOdometry(msgspec.Struct, frozen=True, gc=False):
@@ -268,26 +265,26 @@ class CarriedOdometry(msgspec.Struct, frozen=True, gc=False):
 
     pose: list[float]
     velocity: tuple[float, float, float]  # vx_m_s, vy_m_s in the frame of the map, turn_rad_s
-    back_s: float  # the time it was carried back by; negative: forwards
+    back_s: float  # time by which the pose was extrapolated backwards; negative: forwards
 
     def derivatives(self, hx: float, hy: float, turned: float, *, delayed: bool) -> list[float]:
-        """By the pose of the state, and by the delay if there is one, of what has these by the carried pose."""
+        """Derivatives by the state's pose, and by the delay if ``delayed``, from those by the extrapolated pose."""
         if not delayed and self.back_s == 0.0:
             return [hx, hy, turned]
         vx, vy, turn = self.velocity
         turned += self.back_s * (hx * vy - hy * vx)
-        # the heading turns at ``turn``, too
+        # the delay changes the heading at the rate ``turn``, too
         return [hx, hy, turned, -hx * vx - hy * vy - turn * turned] if delayed else [hx, hy, turned]
 
 
 class DeadReckoning:
-    """Odometry that says what the vehicle will have done after a delay, which may be an estimate.
+    """Odometry that the vehicle follows after a delay, which may be estimated.
 
-    Commanded speeds run ahead of the wheels; stamps of readings may come late or early. Steps wait until they are due:
-    the state is the pose at t - delay by odometry's clock, which is the pose at t by that of the readings. Of a
-    negative delay, odometry that comes late, only an interval can be made up for. What is left, less than an interval,
-    the pose is carried over at constant speed, and the derivative by the delay is that speed (Li and Mourikis 2014).
-    So readings between two steps are taken at their own time even where no delay is asked for.
+    Commanded speeds are ahead of the wheels, and stamps of readings may be late or early. Steps wait until they are
+    due: the state is the pose at t - delay by the clock of the odometry, which is the pose at t by that of the
+    readings. A negative delay (late odometry) is compensated by at most one interval. Over the rest, less than an
+    interval, the pose is extrapolated at constant speed, and the derivative by the delay is that speed (Li and Mourikis
+    2014). So readings between two steps are processed at their own time, even if no delay is estimated.
     """
 
     def __init__(self, *, is_delayed: bool) -> None:
@@ -297,7 +294,7 @@ class DeadReckoning:
         self._rates = (0.0, 0.0, 0.0)  # forwards, to the left, turn
 
     def due(self, odometry: Odometry, delay_s: float) -> Sequence[Odometry]:
-        """The steps, or parts of one, to be taken when ``odometry`` arrives."""
+        """The steps, or parts of one, that are due when ``odometry`` arrives."""
         if not self._is_delayed or not isinstance(odometry, Increment):
             return (odometry,)
         steps, found = self._steps, list[Increment]()
@@ -315,7 +312,7 @@ class DeadReckoning:
         return found
 
     def took(self, odometry: Odometry, before: FloatArray, after: FloatArray) -> float:
-        """A step was taken, from one state to another; its length, m."""
+        """Record the speed of a step from one state to another; returns its length, m."""
         self._until_s, self._interval_s = odometry.time_s, odometry.interval_s
         x, y, heading = before[:POSE].tolist()
         new_x, new_y, new_heading = after[:POSE].tolist()
@@ -326,12 +323,12 @@ class DeadReckoning:
         return hypot(dx, dy)
 
     def at(self, pose: list[float], time_s: float, delay_s: float) -> CarriedOdometry:
-        """The pose, the first of some states, at a reading's time, carried no further than an interval."""
+        """Pose at a reading's time, extrapolated by at most one interval; ``pose``: states that begin with the pose."""
         back_s = self._until_s + delay_s - time_s
-        if not abs(back_s) <= self._interval_s:  # not a number: there was no odometry yet
+        if not abs(back_s) <= self._interval_s:  # also if back_s is NaN: there was no odometry yet
             back_s = copysign(self._interval_s, back_s)
         if back_s == 0.0 and not self._is_delayed:
-            return CarriedOdometry(pose[:POSE], (0.0, 0.0, 0.0), 0.0)  # its speed does not matter
+            return CarriedOdometry(pose[:POSE], (0.0, 0.0, 0.0), 0.0)  # the speed is not used
         ahead, side, turn = self._rates
         heading = pose[2] - back_s * turn
         c, s = cos(heading), sin(heading)

@@ -1,4 +1,4 @@
-"""The log-distance model of signal strength, and its calibration from pairs of distance and level."""
+"""Log-distance model of signal strength, and its calibration from pairs of distance and level."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class PathLoss(NamedTuple):
         return self.reference_dbm - 10.0 * self.exponent * log10(range_m)
 
     def median_range_m(self, level_dbm: float) -> float:
-        """The inverse of the model, 2017: r = 10^((|z| - |P_ref|) / (10 eta)). Half of such ranges are too long."""
+        """Inverse of the model (2017): r = 10^((|z| - |P_ref|) / (10 eta)). Half of such ranges are too long."""
         return float(10.0 ** ((self.reference_dbm - level_dbm) / (10.0 * self.exponent)))
 
     @property
@@ -37,35 +37,35 @@ class PathLoss(NamedTuple):
 
 
 LEAST_EXPONENT = 0.1  # free space has 2; levels that hardly fall give no distance
-LEAST_PLACES = 3  # two unknowns and one for the spread
-_PLAUSIBLE_EXPONENT = (1.0, 6.0)  # a corridor that guides waves has 1.2, a building with walls in the way up to 6
-_LOUDEST_DBM = -10.0  # 20 dBm sent are -20 dBm at 1 m in free space, at 2.4 GHz
+LEAST_PLACES = 3  # two unknowns and one degree of freedom for the spread
+_PLAUSIBLE_EXPONENT = (1.0, 6.0)  # a corridor acts as a waveguide and has 1.2; a building with walls has up to 6
+_LOUDEST_DBM = -10.0  # 20 dBm transmitted are -20 dBm at 1 m in free space, at 2.4 GHz
 _EXACT_DB = 1e-6
-_FAR_OFF = 3.5  # studentised residual of a place that wants a second look
+_FAR_OFF = 3.5  # studentised residual above which a place is reported
 
 
 class PathLossError(ValueError):
-    """Pairs from which no path loss follows; the message carries the numbers."""
+    """Pairs to which no path loss can be fitted; the message contains the numbers."""
 
 
 class LevelPair(NamedTuple):
-    """One reading."""
+    """One reading of a level."""
 
     distance_m: float
     level_dbm: float
-    place: tuple[float, float] | None = None  # where; readings without a place belong to the place of their distance
+    place: tuple[float, float] | None = None  # readings without a place and with the same distance count as one place
 
 
 @dataclass(frozen=True, slots=True)
 class PathLossFit:
-    """Path loss z = P_ref - 10 eta log10(r) with the confidence of its two parameters."""
+    """Path loss z = P_ref - 10 eta log10(r) with the covariance of its two parameters."""
 
     reference_dbm: float
     exponent: float
     covariance: FloatArray  # of both, shape (2, 2)
-    sigma_db: float  # spread of the levels of places about the line, whatever makes it
-    white_sigma_db: float  # of repeated readings at one place; NaN where nothing was repeated
-    shadowing_sigma_db: float  # of what stays with a place, sigma without the white part; NaN likewise
+    sigma_db: float  # standard deviation of the places' mean levels about the line
+    white_sigma_db: float  # of repeated readings at one place; NaN if there are none
+    shadowing_sigma_db: float  # of the constant error of a place: sigma without the white part; NaN likewise
     places: int
     readings: int
     residuals_db: FloatArray  # mean level minus line of each place, shape (places,)
@@ -73,7 +73,7 @@ class PathLossFit:
 
     @property
     def path_loss(self) -> PathLoss:
-        """The model, its noise that of a reading at a new place."""
+        """The model, with ``sigma_db`` as noise."""
         return PathLoss(self.reference_dbm, self.exponent, self.sigma_db)
 
     @property
@@ -82,7 +82,7 @@ class PathLossFit:
         return self.places - 2
 
     def half_widths(self, confidence: float) -> tuple[float, float]:
-        """Of the two-sided confidence intervals of P_ref, dB, and eta (Student's t)."""
+        """Half widths of the two-sided confidence intervals of P_ref, dB, and eta (Student's t)."""
         quantile = float(stdtrit(self.freedom, 0.5 + 0.5 * confidence))
         return quantile * sqrt(self.covariance[0, 0]), quantile * sqrt(self.covariance[1, 1])
 
@@ -94,7 +94,7 @@ class PathLossFit:
         return sqrt(square / low), sqrt(square / high)
 
     def data(self, confidence: float) -> dict[str, Any]:
-        """The calibration for JSON, with confidence intervals; None where nothing was repeated."""
+        """The calibration for JSON, with confidence intervals; parts of sigma are None if no reading was repeated."""
         reference, exponent = self.half_widths(confidence)
         low, high = self.sigma_interval_db(confidence)
         is_repeated = not isnan(self.white_sigma_db)
@@ -115,14 +115,14 @@ class PathLossFit:
         }
 
     def predicted(self, distances_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and scale of the level of a new place at distances (n,): Student's t with ``freedom``, both (n,)."""
+        """Mean and scale, both (n,), of Student's t with ``freedom`` for the level of a new place at distances (n,)."""
         rows = np.column_stack([np.ones(distances_m.size), -10.0 * np.log10(distances_m)])
         mean = rows @ (self.reference_dbm, self.exponent)
         scale = np.sqrt(self.sigma_db**2 + np.einsum("ij,jk,ik->i", rows, self.covariance, rows))
         return mean, scale
 
     def doubts(self) -> list[str]:
-        """What does not look like a path loss, a line each."""
+        """A warning for each implausible parameter, and for each outlier."""
         found = []
         low, high = _PLAUSIBLE_EXPONENT
         if not low <= self.exponent <= high:
@@ -153,9 +153,9 @@ class PathLossFit:
 def fit_path_loss(pairs: Iterable[LevelPair]) -> PathLossFit:
     """Least squares line of level over -10 log10(distance).
 
-    Every place counts once, with the mean of its readings: what is off at a place is off for all of them, so a hundred
-    readings at one place do not count as a hundred. Raises PathLossError: fewer than three distances, one that is not
-    positive, one that is not finite, or levels that do not fall with distance.
+    Every place counts once, with the mean of its readings, because readings at one place have the same shadowing error.
+    Raises PathLossError: fewer than three different distances, a distance that is not positive, a value that is not
+    finite, or levels that do not fall with distance.
     """
     by_place: dict[tuple[float, tuple[float, float] | None], list[float]] = {}
     for pair in pairs:
@@ -184,7 +184,7 @@ def fit_path_loss(pairs: Iterable[LevelPair]) -> PathLossFit:
 
 
 def _parts(groups: list[list[float]], variance_db2: float) -> tuple[float, float]:
-    """White and static standard deviations; NaN where no place has two readings."""
+    """White and static standard deviations, dB; NaN if no place has two readings."""
     freedom = sum(len(group) - 1 for group in groups)
     if freedom == 0:
         return nan, nan

@@ -1,4 +1,4 @@
-"""Recorded runs and readings in the units and the order that estimators want, and what estimators make of them."""
+"""Recorded runs and readings in SI units and order of time, and the results of the estimators."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ BoolArray = npt.NDArray[np.bool_]
 class Steps(NamedTuple):
     """Dead reckoning, one step a row: step k carries the vehicle from times_s[k] to times_s[k + 1].
 
-    ``guess_m2``: variance of the end of a step, along and across, where the odometry was silent and the way is guessed,
-    m^2, shape (n,); 0.0: none is.
+    ``guess_m2``: variance of the end of a step, along and across, if the odometry was missing and the motion is
+    guessed, m^2, shape (n,); 0.0: no step is guessed.
     """
 
-    times_s: FloatArray  # where steps begin and end, s, shape (n + 1,), rising
+    times_s: FloatArray  # times at which steps begin and end, s, shape (n + 1,), rising
     distance_m: FloatArray  # forward travel within a step, m, shape (n,)
     turn_rad: FloatArray  # turn within a step, counter-clockwise, rad, shape (n,)
     lateral_m: FloatArray  # travel to the left within a step, m, shape (n,); zeros for wheels that do not slip
     guess_m2: FloatArray | float = 0.0
-    guess_rad2: FloatArray | float = 0.0  # the same of its turn, rad^2
+    guess_rad2: FloatArray | float = 0.0  # variance of its turn, in the same case, rad^2
 
 
 class Readings(NamedTuple):
@@ -38,34 +38,34 @@ class Readings(NamedTuple):
     rssi_dbm: FloatArray  # signal strength, dBm, shape (m,); NaN where none was measured
 
     def where(self, rows: BoolArray | IntArray) -> "Readings":
-        """Some of the readings."""
+        """The readings of a mask or of indices."""
         return Readings(
             self.times_s[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows], self.rssi_dbm[rows]
         )
 
     def with_distances(self, camera_field_rad: float) -> "Readings":
-        """The readings of a camera that ranges by apparent height, with distances in place of depths.
+        """The readings of a camera that measures ranges by apparent height, with distances instead of depths.
 
-        On a rectified image the height falls with the depth along the axis, r cos(bearing). ``camera_field_rad``: half
-        the field of view, over which such ranges are right in the mean; 0: ranges are distances, as they are where most
-        bearings lie outside the field.
+        On a rectified image the height depends on the depth along the axis, r cos(bearing). Ranges are taken as
+        calibrated in the mean over the field: r = depth f / cos(bearing), f the mean cosine. ``camera_field_rad``: half
+        the field of view; 0: ranges are distances. They are not changed either if most bearings lie outside the field.
         """
         off_axis = np.abs(self.bearing_rad)
         seen = off_axis < 0.5 * np.pi
         if camera_field_rad <= 0.0 or not seen.any() or np.nanmedian(off_axis) > camera_field_rad:
             return self
-        mean = np.sin(camera_field_rad) / camera_field_rad  # of the cosine over the field
+        mean = np.sin(camera_field_rad) / camera_field_rad  # f, the mean cosine over the field
         distances_m = self.range_m * mean / np.cos(self.bearing_rad, where=seen, out=np.ones(len(seen)))
         return self._replace(range_m=np.where(seen, distances_m, self.range_m))
 
 
 class ReferencePath(NamedTuple):
-    """Where the vehicle was, world frame."""
+    """Ground truth of the path, world frame."""
 
     times_s: FloatArray  # shape (k,), s, rising
     x_m: FloatArray  # shape (k,), m
     y_m: FloatArray  # shape (k,), m
-    heading_rad: FloatArray  # shape (k,), rad, continuous; NaN where the reference saw positions alone
+    heading_rad: FloatArray  # shape (k,), rad, continuous; NaN if the reference measured positions alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +73,12 @@ class RecordedRun:
     """One vehicle's run among beacons.
 
     ``beacon_truth_m``: surveyed x, y by name, world frame, m; beacons that were not surveyed are missing.
-    ``first_pose``: x_m, y_m, heading_rad at the first odometry time, world frame: the one thing that an estimator may
-    take from the truth; the origin if there is no truth.
+    ``first_pose``: x_m, y_m, heading_rad at the first odometry time, world frame: the only part of the truth that an
+    estimator may use; the origin if there is no truth.
     """
 
     name: str
-    kind: str  # format that it was read from: plaza, mrclam, labyrinth or csv
+    kind: str  # format of the file: plaza, mrclam, labyrinth or csv
     steps: Steps
     readings: Readings
     beacon_ids: tuple[str, ...]
@@ -90,14 +90,14 @@ class RecordedRun:
 
 
 def running_total(amounts: FloatArray) -> FloatArray:
-    """0, and the sums of the first amounts (n,), shape (n + 1,)."""
+    """Cumulative sums of amounts (n,), beginning with 0, shape (n + 1,)."""
     return np.concatenate([[0.0], np.cumsum(amounts)])
 
 
 def dead_reckoned(steps: Steps, first_pose: tuple[float, float, float]) -> FloatArray:
     """Poses x_m, y_m, heading_rad at ``steps.times_s`` by odometry alone, shape (n + 1, 3).
 
-    Each step is a chord at the mean heading: x <- x + d cos(heading + turn / 2), thesis eq. 2.14 as it is meant.
+    Each step is a straight line at the mean heading: x <- x + d cos(heading + turn / 2), thesis eq. 2.14, corrected.
     """
     x_m, y_m, heading_rad = first_pose
     headings = heading_rad + running_total(steps.turn_rad)
@@ -108,7 +108,7 @@ def dead_reckoned(steps: Steps, first_pose: tuple[float, float, float]) -> Float
 
 
 def antenna_path(poses: FloatArray, antenna_m: tuple[float, float], sign: float = 1.0) -> FloatArray:
-    """Positions of the antenna at poses of the vehicle, (n, 2); with the other sign, of the vehicle at the antenna's.
+    """Antenna positions at poses of the vehicle, (n, 2); with ``sign`` -1, vehicle positions at poses of the antenna.
 
     ``poses``: x_m, y_m, heading_rad, shape (n, 3).
     """
@@ -127,14 +127,14 @@ class BeaconFix(NamedTuple):
 
 
 class Calibrated(NamedTuple):
-    """A quantity found on the way."""
+    """Estimated calibration parameter."""
 
     value: float
     sigma: float
 
 
 class DelayedPath(NamedTuple):
-    """Where the vehicle was, from readings up to ``lag_s`` later; the last poses from those that there were."""
+    """Path estimated from readings up to ``lag_s`` later; the last poses from the readings up to the end of the run."""
 
     lag_s: float
     times_s: FloatArray  # shape (n,), rising
@@ -145,10 +145,10 @@ class DelayedPath(NamedTuple):
 class EstimatedPath(NamedTuple):
     """An estimate of a run.
 
-    ``nis``: normalised innovations squared of the readings that were used, shape (u,); none from a smoother.
-    ``update_s``: wall time of each reading, the prediction to it included, s; of a smoother its whole time shared among
-    the readings. ``scalar_s``: wall time of each scalar of a reading of a beacon on the map, s, without prediction;
-    none from a smoother.
+    ``nis``: normalised innovations squared of the readings that were used, shape (u,); empty from a smoother.
+    ``update_s``: elapsed time of each reading with its prediction, s; for a smoother its whole time divided by the
+    number of readings. ``scalar_s``: elapsed time of each scalar of a reading of a beacon on the map, s, without
+    prediction; empty from a smoother.
     """
 
     times_s: FloatArray  # shape (n,), rising
@@ -156,13 +156,13 @@ class EstimatedPath(NamedTuple):
     covariances: FloatArray  # of the poses, shape (n, 3, 3)
     beacons: Mapping[str, BeaconFix]
     calibration: Mapping[str, Calibrated]
-    refused: int  # how many readings were refused, or weigh less than a tenth
+    refused: int  # number of readings that were refused, or have a weight below a tenth
     updates: int
     warnings: tuple[str, ...]
     nis: FloatArray = np.empty(0)
     nis_sizes: FloatArray = np.empty(0)  # their degrees of freedom, shape (u,)
     update_s: FloatArray = np.empty(0)
-    predict_s: FloatArray = np.empty(0)  # wall time of each prediction, s; none from a smoother
+    predict_s: FloatArray = np.empty(0)  # elapsed time of each prediction, s; empty from a smoother
     scalar_s: FloatArray = np.empty(0)
     delayed: DelayedPath | None = None
     map_covariance: FloatArray = np.empty((0, 0))  # of all beacons' x_m, y_m in their order, shape (2 b, 2 b)
@@ -172,17 +172,17 @@ BeaconId = int | str
 
 
 class Reading(NamedTuple):
-    """What was measured of a beacon at once: a range or a signal strength, a direction alone, or both."""
+    """One reading of a beacon: a range or a signal strength, a bearing, or a bearing with one of them."""
 
     time_s: float
     beacon: BeaconId
-    range_m: float = nan  # as it was measured, scale error, offset and all
+    range_m: float = nan  # as measured, with errors of scale and offset
     bearing_rad: float | None = None  # from the vehicle's heading, counter-clockwise; None without a direction
     rssi_dbm: float = nan
 
 
 class BeaconEstimate(NamedTuple):
-    """A beacon on the map, or what is known of it before its readings."""
+    """Estimate of a beacon on the map, or its prior."""
 
-    mean: FloatArray  # x_m, y_m and what else is estimated of it (reference_dbm, exponent, shadowing), shape (b,)
+    mean: FloatArray  # x_m, y_m and further states of the beacon (reference_dbm, exponent, shadowing), shape (b,)
     covariance: FloatArray  # shape (b, b)

@@ -1,4 +1,4 @@
-"""EKF-SLAM by levels and bearings of radios, one of which moves; from packets of a turning reflector to a bearing."""
+"""EKF-SLAM by levels and bearings of radios, one of which moves; bearings from packets of a rotating reflector."""
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
@@ -19,8 +19,8 @@ from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
 
 _ITERATIONS = 4
-_NEAREST_M = 0.02  # nearer than that a distance has no derivative worth the name
-# The textbook's filter: no knee, nothing learned, no pose and no radio doubted.
+_NEAREST_M = 0.02  # smallest distance, so that derivatives of the distance exist
+# The standard EKF: no robust weights, no learned noise, no check for jumps of the pose or moved radios.
 _PLAIN = SlamFilterConfig(
     knee_sigmas=1e3, learn_memory=0.0, learn_prior=1.0, doubt_pose_after=10**9, doubt_beacon_after=10**9, jump_m=1.0,
     jump_rad=1.0, transports=False, wander_share=0.0, wander_length_m=1.0, rest_speed_m_s=0.0, rest_turn_rad_s=0.0,
@@ -31,24 +31,24 @@ _APART_RAD = pi / 2.0  # strongest readings further apart than this are two dire
 
 @dataclass(frozen=True, slots=True)
 class ReflectorScan:
-    """How scans are taken and read: 40 readings of one turn are steps of 9 degrees (Hevrdejs and Knoll 2017)."""
+    """Scans of a rotating reflector: 40 readings of one turn are steps of 9 degrees (Hevrdejs and Knoll 2017)."""
 
     cfg: ScanConfig
 
     @property
     def step_rad(self) -> float:
-        """Between two readings."""
+        """Angle between two readings."""
         return tau / self.cfg.readings
 
     @property
     def sigma_rad(self) -> float:
-        """Of a bearing: noise, and a direction that may lie anywhere within a step (variance step^2 / 12)."""
+        """Standard deviation of a bearing: noise and quantisation by a step (variance step^2 / 12)."""
         return hypot(self.cfg.bearing_sigma_rad, self.step_rad / 12.0**0.5)
 
     def results(self, time_s: float, packets: Iterable[tuple[str, float, float]]) -> list[Reading]:
         """Level and bearing of each radio after a turn of the reflector, in the order of their first packets.
 
-        ``packets``: radio, direction of the reflector left of the heading (rad), level (dBm).
+        ``packets``: radio, direction of the reflector from the heading, counter-clockwise (rad), level (dBm).
         """
         by_beacon: dict[str, list[tuple[float, float]]] = {}
         for beacon, direction_rad, level_dbm in packets:
@@ -57,7 +57,11 @@ class ReflectorScan:
         return [Reading(time_s, beacon, bearing_rad=bearing, rssi_dbm=z) for beacon, (bearing, z) in found.items()]
 
     def _result(self, readings: Sequence[tuple[float, float]]) -> tuple[float | None, float]:
-        """Bearing, where there is one, and level."""
+        """Bearing or None, and level.
+
+        Without a bearing, or with too many lost packets, the bearing is None and the level is the largest one.
+        Otherwise the level is the mean of the readings within a step of the bearing.
+        """
         bearing_rad = self._bearing(readings)
         strongest_dbm = max(level_dbm for _, level_dbm in readings)
         if bearing_rad is None or len(readings) / self.cfg.readings < 1.0 - self.cfg.loss_tolerance:
@@ -67,7 +71,7 @@ class ReflectorScan:
         return bearing_rad, sum(levels) / len(levels)
 
     def _bearing(self, readings: Sequence[tuple[float, float]]) -> float | None:
-        """Direction of the strongest reading, 2017 eq. 5; the middle of equals that lie together, else None."""
+        """Direction of the strongest reading, 2017 eq. 5; the mean of equally strong ones, or None if far apart."""
         strongest_dbm = max(level_dbm for _, level_dbm in readings)
         tied = [direction for direction, level_dbm in readings if level_dbm == strongest_dbm]
         c, s = sum(map(cos, tied)), sum(map(sin, tied))
@@ -79,23 +83,26 @@ class ReflectorScan:
 
 
 class SignalSlam(BeaconSlam):
-    """EKF-SLAM of a vehicle among radios whose path loss is known; levels are used as they are, in dB.
+    """EKF-SLAM of a vehicle among radios with known path loss; levels are measurements in dB.
 
     A level is z = P_ref - 10 eta log10(r) + b + noise with b the static shadowing, a bearing
     beta = atan2(dy, dx) - heading + noise (Auth and Hovey 2018, eqs 2.3 and 2.9). States of a static radio:
-    x_m, y_m, and those of its shadowing where there is a map of it; of the moving one: x_m, y_m, its velocity, and its
-    shadowing where there is any. Updates are iterated, because an error of 18 degrees is too large for one
-    linearisation. A level of unknown shadowing gives the range up to a factor; an update that is linearised there is
-    wrong later, when bearings from elsewhere have given the range. So the readings of a new radio wait until they
-    place it. A radio of which no bearing is known is not used: a level alone is a circle. A static radio is in the
-    room, or as near to it as is set: while its readings wait, a place beyond costs what that error of the wall's does.
+    x_m, y_m, and those of its shadowing if there is a map of it; of the moving one: x_m, y_m, its velocity, and its
+    shadowing if there is any.
 
-    The vehicle begins at the believed start of the configuration, which defines the frame of the map.
+    Updates are iterated, because an error of 18 degrees is too large for one linearisation. A level with unknown
+    shadowing determines the range only up to a factor; an update linearised at that range becomes wrong when bearings
+    from other places determine the range. So the readings of a new radio wait until they determine its place. A radio
+    without a bearing is not used, because its place may be anywhere on a circle. A static radio lies in the room or
+    within a configured distance of it: while its readings wait, a place beyond that costs as much as the same error of
+    the wall.
+
+    The vehicle begins at the start of the configuration, which defines the frame of the map.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
         start, loss, estimator, room_m = cfg.start, cfg.path_loss, cfg.estimator, cfg.workspace.size_m
-        # Static shadowing without a map of it counts as white noise.
+        # Static shadowing without a map is treated as white noise.
         sigma_db = loss.shadowing_sigma_db if estimator.shadowing != "none" else 0.0
         length_m, shadowing, white_db = loss.shadowing_length_m, None, hypot(loss.white_sigma_db, sigma_db)
         if estimator.shadowing == "map" and sigma_db > 0.0:
@@ -110,39 +117,39 @@ class SignalSlam(BeaconSlam):
         P0 = np.diag(np.square((start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad)))
         beyond_m = estimator.radios_beyond_m
         self._within_m = np.array([(-beyond_m, wall_m + beyond_m) for wall_m in room_m]).T
-        # The walls are known in the room, the map has the frame of the believed start.
+        # The walls are known in the frame of the room, the map has the frame of the configured start.
         self._wall_variance_m2 = start.position_sigma_m**2 + (0.5 * start.heading_sigma_rad * hypot(*room_m)) ** 2
         super().__init__(
             SlippingVehicle(cfg.vehicle, cfg.odometry), models, _PLAIN, (start.x_m, start.y_m, start.heading_rad), P0,
             gate=float(chdtri(1, 1.0 - estimator.gate_probability)), iterations=_ITERATIONS,
         )  # fmt: skip
         self._ahead: SignalSlam | None = None
-        # In a room without a radio that moves, its name is never received.
+        # If no radio moves, this name is never received.
         speed_m_s, course_time_s = estimator.target_speed_sigma_m_s, estimator.target_course_time_s
         self._moving = MovingRadio(cfg.follow.target, speed_m_s, course_time_s, sigma_db, length_m, room_m)
         self._moving_variances = loss.white_sigma_db**2, bearing_sigma_rad**2
         self._placed_share, self._waiting_scans = estimator.placed_share, estimator.waiting_scans
-        # Largest normalised innovation squared that is used of the radio that moves, of one row and of two.
+        # Largest normalised innovation squared that is accepted from the moving radio, for one row and for two.
         self._gates = tuple(float(chdtri(rows, 1.0 - estimator.gate_probability)) for rows in (1, 2))
 
     @property
     def _likely(self) -> "SignalSlam":
-        """The filter as it is most likely: with the radios on the map that still wait."""
+        """The filter with the waiting radios on the map, at their most likely places."""
         return self if self._ahead is None else self._ahead
 
     @property
     def pose(self) -> VehiclePose:
-        """The vehicle; the heading does not wrap."""
+        """Pose of the vehicle; the heading does not wrap."""
         return VehiclePose(*self._likely.engine.mean[:POSE].tolist())
 
     @property
     def pose_covariance(self) -> FloatArray:
-        """Of x_m, y_m, heading_rad, shape (3, 3)."""
+        """Covariance of x_m, y_m, heading_rad, shape (3, 3)."""
         return self._likely.engine.covariance[:POSE, :POSE].copy()
 
     @property
     def beacons(self) -> dict[BeaconId, BeaconEstimate]:
-        """The map, and where the radios are likely that still wait: places alone, x_m and y_m."""
+        """Places x_m, y_m of all radios on the map, and the most likely places of those that wait."""
         found: dict[BeaconId, BeaconEstimate] = {}
         for beacon in self._likely.engine.blocks:
             if isinstance(beacon, int | str):
@@ -151,7 +158,7 @@ class SignalSlam(BeaconSlam):
         return found
 
     def predict(self, odometry: Odometry) -> None:
-        """Carry the vehicle and the moving radio on."""
+        """Predict the vehicle and the moving radio."""
         before_m = self._way_m
         super().predict(odometry)
         if self._moving.beacon in self.engine:
@@ -160,7 +167,7 @@ class SignalSlam(BeaconSlam):
             self._ahead.predict(odometry)
 
     def observe(self, readings: Iterable[Reading]) -> list[BeaconInnovation]:
-        """Take readings of any radios, one after the other; new ones are placed when their readings suffice."""
+        """Process readings of any radios; a new static radio joins the map when its readings determine its place."""
         readings, moving, of_others, learned = list(readings), self._moving, list[Reading](), list[BeaconInnovation]()
         if self._ahead is not None:
             self._ahead.observe([reading for reading in readings if reading.beacon not in self.waiting])
@@ -170,7 +177,7 @@ class SignalSlam(BeaconSlam):
             elif moving.beacon in self.engine:
                 found = self._update_moving(reading)
                 learned.append(BeaconInnovation(reading.beacon, found.nis, found.size, found.accepted))
-            elif reading.bearing_rad is not None:  # it joins at its first bearing: it would be elsewhere later
+            elif reading.bearing_rad is not None:  # joins at its first bearing: it moves, so its readings cannot wait
                 moving.join(self.engine, reading.bearing_rad)
                 self._update_moving(reading)
         self.learned = learned + super().observe(of_others)
@@ -184,7 +191,7 @@ class SignalSlam(BeaconSlam):
         return self.learned
 
     def _with_all(self) -> "SignalSlam":
-        """The filter with all radios on the map that wait, sure or not."""
+        """A copy of the filter with all waiting radios on the map, however uncertain."""
         self._ahead = None
         ahead = deepcopy(self)
         for waiting in list(ahead.waiting.values()):
@@ -202,7 +209,7 @@ class SignalSlam(BeaconSlam):
         return _RowsInRoom(super()._stacked(waiting), self._within_m, self._wall_variance_m2)
 
     def _place_new(self, waiting: PendingLandmark) -> None:
-        """Not before all readings have been taken."""
+        """Does nothing: ``observe`` adds radios after it has processed all readings."""
 
     def _is_ready(self, waiting: PendingLandmark) -> bool:
         if waiting.beacon not in self._likely.engine:
@@ -212,12 +219,12 @@ class SignalSlam(BeaconSlam):
         mean, covariance = self.joint((waiting.beacon,))
         x, y, _, bx, by = mean.tolist()
         if (np.clip((bx, by), *self._within_m) != (bx, by)).any():
-            return False  # sure by the walls, not by readings
+            return False  # the walls limit the place, not the readings
         largest = float(np.linalg.eigvalsh(covariance[POSE:, POSE:])[-1])
         return largest < (self._placed_share * hypot(bx - x, by - y)) ** 2
 
     def distance(self, beacon: BeaconId) -> tuple[float, float]:
-        """Between the vehicle and a radio, m, and its standard deviation. Raises BlockError: it is not on the map."""
+        """Distance from vehicle to radio and its standard deviation, m. Raises BlockError: it is not on the map."""
         start = self._likely.engine.block(beacon).start
         mean, covariance = self._of(columns_of(range(PLACE), range(start, start + PLACE)))
         x, y, bx, by = mean.tolist()
@@ -227,7 +234,7 @@ class SignalSlam(BeaconSlam):
 
     @property
     def moving_velocity_m_s(self) -> tuple[float, float]:
-        """Of the radio that moves; 0 before it was received."""
+        """Velocity of the moving radio; 0 before it was received."""
         if self._moving.beacon not in self.engine:
             return 0.0, 0.0
         start = self.engine.block(self._moving.beacon).start + PLACE
@@ -235,7 +242,7 @@ class SignalSlam(BeaconSlam):
         return vx, vy
 
     def joint(self, beacons: Sequence[BeaconId]) -> tuple[FloatArray, FloatArray]:
-        """Pose and the places of some radios on the map together: mean (3 + 2 k,) and covariance.
+        """Joint mean (3 + 2 k,) and covariance of the pose and the places of k radios.
 
         Raises BlockError: one is not on the map.
         """
@@ -257,14 +264,14 @@ class SignalSlam(BeaconSlam):
 
 
 class _RowsInRoom(StackedRows):
-    """The rows of a radio and of the walls: as far as a coordinate is beyond one, the wall's place is in error."""
+    """The rows of a radio and of the walls: the distance of a coordinate beyond a wall is an error of the wall."""
 
     def __init__(self, rows: StackedRows, within_m: FloatArray, variance_m2: float) -> None:
         self._rows, self._within_m, self._variances_m2 = rows, within_m, np.full(PLACE, variance_m2)
         self.blocks, self.columns = rows.blocks, rows.columns
 
     def at(self, x: FloatArray, beacon: list[float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """As those of the readings, with a row for each coordinate of the place behind them."""
+        """The rows of the readings, followed by one row for each coordinate of the place."""
         H, G, e, R = self._rows.at(x, beacon)
         place = np.array(beacon[:PLACE])
         inwards = np.clip(place, *self._within_m) - place
@@ -273,20 +280,21 @@ class _RowsInRoom(StackedRows):
         return H, np.vstack([G, walls]), np.append(e, inwards), np.append(R, self._variances_m2)
 
 
-_TYPICAL = 0.4  # mean distance of two places in a square over its diagonal: 0.521 / sqrt(2)
+_TYPICAL = 0.4  # mean distance of two points in a square, over its diagonal: 0.521 / sqrt(2), rounded up
 _STATES = 4  # x_m, y_m, and the velocity
 
 
 @dataclass(frozen=True, slots=True)
 class MovingRadio:
-    """A point whose velocity is a stationary process: v has the spread s by axis and forgets it over a time T.
+    """A point whose velocity is a stationary process: standard deviation s per axis, correlation time T.
 
     Over t, with a = exp(-t / T): v <- a v, p <- p + T (1 - a) v, and
 
         var(v) += s^2 (1 - a^2),  cov(p, v) += s^2 T (1 - a)^2,  var(p) += s^2 T (2 t - T (1 - a) (3 - a))
 
-    (Singer 1970 with the velocity in place of the acceleration). Shadowing at both ends decorrelates with the ways of
-    both: b <- c b with c = exp(-(d_vehicle + d_radio) / L), d_radio = sqrt(2) s t, and var(b) += sigma^2 (1 - c^2).
+    (Singer 1970 with the velocity instead of the acceleration). The shadowing decorrelates with the distances that both
+    ends travel: b <- c b with c = exp(-(d_vehicle + d_radio) / L), d_radio = sqrt(2) s t, and
+    var(b) += sigma^2 (1 - c^2).
     """
 
     beacon: BeaconId
@@ -297,10 +305,10 @@ class MovingRadio:
     room_m: tuple[float, float]  # lengths of its walls; it never leaves the room
 
     def join(self, engine: EkfSlam, bearing_rad: float) -> None:
-        """Begin in the direction of a first bearing, anywhere in the room; the reading itself is to follow.
+        """Add the radio with a vague prior, in the direction of its first bearing; the reading itself must follow.
 
-        In polar coordinates about the vehicle: the direction is spread over the circle, and the distance as between
-        two places in the room, by a factor of two about 0.4 of its diagonal.
+        The prior is Gaussian in polar coordinates about the vehicle: standard deviations of pi for the direction, and
+        of a factor of two for the distance, about 0.4 times the diagonal of the room.
         """
         direction, log_range = float(engine.mean[2]) + bearing_rad, log(_TYPICAL * hypot(*self.room_m))
         behind = [self.speed_sigma_m_s] * 2
@@ -317,11 +325,11 @@ class MovingRadio:
         self, engine: EkfSlam, reading: Reading, path_loss: PathLoss, variances: tuple[float, float],
         gates: Sequence[float],
     ) -> Update:  # fmt: skip
-        """Condition on a reading, in polar coordinates about the vehicle.
+        """Update by a reading, in polar coordinates about the vehicle.
 
-        There level and bearing are linear: z = P_ref - (10 eta / ln 10) ln r + b, beta = direction - heading. In the
-        plane a level has another slope at each estimate, and many levels with one unknown b would seem to give the
-        range (modified polar coordinates, Aidala and Hammel 1983).
+        In these coordinates level and bearing are linear: z = P_ref - (10 eta / ln 10) ln r + b, beta = direction -
+        heading. In Cartesian coordinates the slope of a level changes with the estimate, so many levels with one
+        unknown b would falsely determine the range (modified polar coordinates, Aidala and Hammel 1983).
         """
         self._to_polar(engine)
         slope = 10.0 * path_loss.exponent / log(10.0)
@@ -352,7 +360,7 @@ class MovingRadio:
         _transformed(engine, start, np.array(((-dy, dx), (dx, dy))), np.eye(PLACE), (x + dx, y + dy))
 
     def predict(self, engine: EkfSlam, interval_s: float, travel_m: float) -> None:
-        """Carry the radio's block on over an interval in which the vehicle travelled so far."""
+        """Predict the radio's block over an interval in which the vehicle travelled ``travel_m``."""
         block = engine.block(self.beacon)
         s2, T = self.speed_sigma_m_s**2, self.course_time_s
         a = exp(-interval_s / T)

@@ -1,4 +1,4 @@
-"""A track for other eyes: residuals of its readings, the file that evo reads, and what to measure next."""
+"""Review of an estimated path: residuals of its readings, the file for evo, and the best next measurement."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -11,12 +11,12 @@ from ccatp.config.beacon_models import RadioNoiseConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import rigid_modes
 
-_PLACES = 200  # along the path, at which a reading is considered
+_PLACES = 200  # number of places along the path at which a next reading is considered
 _NONE = Calibrated(0.0, 0.0)
 
 
 def range_residuals(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -> FloatArray:
-    """Calibrated ranges less those of path and map, m, shape (m,); NaN without a range or a beacon on the map."""
+    """Calibrated ranges minus those of path and map, m, shape (m,); NaN without a range or a beacon on the map."""
     nowhere = np.full(2, np.nan)
     places = np.array([track.beacons[name][:2] if name in track.beacons else nowhere for name in run.beacon_ids])
     r = run.readings.with_distances(camera_field_rad)
@@ -26,7 +26,7 @@ def range_residuals(run: RecordedRun, track: EstimatedPath, camera_field_rad: fl
 
 
 def residuals_by_beacon(run: RecordedRun, residuals_m: FloatArray) -> dict[str, dict[str, float]]:
-    """Number, median and half the width of the middle 68 % of the residuals of each beacon that has some, m."""
+    """Number, median and half the width of the middle 68 % of the residuals, m, of each beacon that has residuals."""
     found = {}
     for k, name in enumerate(run.beacon_ids):
         own = residuals_m[(run.readings.beacon == k) & np.isfinite(residuals_m)]
@@ -37,7 +37,7 @@ def residuals_by_beacon(run: RecordedRun, residuals_m: FloatArray) -> dict[str, 
 
 
 def tum_lines(times_s: FloatArray, poses: FloatArray, antenna_m: tuple[float, float] = (0.0, 0.0)) -> Iterator[str]:
-    """Poses of the vehicle as ``evo`` reads them: time, x, y, z, and the quaternion x, y, z, w.
+    """Poses of the vehicle in the TUM format of ``evo``: time, x, y, z, and the quaternion x, y, z, w.
 
     ``poses``: x_m, y_m, heading_rad of the antenna, shape (n, 3).
     """
@@ -47,21 +47,21 @@ def tum_lines(times_s: FloatArray, poses: FloatArray, antenna_m: tuple[float, fl
 
 
 class NextRange(NamedTuple):
-    """The range that lessens the error of a map most, and the error expected before and behind it."""
+    """The range that reduces the error of a map most, and the expected error before and after it."""
 
     ends: tuple[int, int]  # beacon and place, or two motes
-    before_m: float  # root mean square of a place, of the map after the best rigid motion
+    before_m: float  # root mean square error of a position, after the best rigid alignment of the map
     after_m: float
 
 
 def next_range(
     points_m: FloatArray, covariance_m2: FloatArray, ends: np.ndarray, ways_m: FloatArray, sigmas_m: FloatArray
 ) -> NextRange | None:
-    """The best of some ranges: tr P falls by |P h|^2 / (h^T P h + sigma^2); None where the map has no shape to learn.
+    """The best of m possible ranges: tr P falls by |P h|^2 / (h^T P h + sigma^2); None with fewer than three points.
 
     ``points_m``: of the map, shape (n, d). ``covariance_m2``: shape (n d, n d). ``ends``: of each range, shape (m, 2);
-    an end that is n or more is a place and no part of the map. ``ways_m``: from the second end to the first, shape (m,
-    d). ``sigmas_m``: shape (m,).
+    an end of n or more is a known place, not a point of the map. ``ways_m``: vectors from the second end to the first,
+    shape (m, d). ``sigmas_m``: shape (m,).
     """
     count, d = points_m.shape
     if count < 3 or not len(ends):
@@ -72,7 +72,7 @@ def next_range(
     u = ways_m / np.maximum(np.linalg.norm(ways_m, axis=1), 1e-9)[:, None]
     blocks = np.concatenate([P.reshape(count * d, count, d), np.zeros((count * d, 1, d))], axis=1)
     first, second = np.minimum(ends, count).T
-    # P h of each range, shape (n d, m); a place, which is no part of the map, adds nothing.
+    # P h of each range, shape (n d, m); an end that is not a point of the map contributes zero.
     Ph = np.einsum("amk,mk->am", blocks[:, first] - blocks[:, second], u)
     rows = np.concatenate([Ph.reshape(count, d, -1), np.zeros((1, d, len(u)))])
     at = np.arange(len(u))
@@ -84,7 +84,7 @@ def next_range(
 
 
 def next_reading(track: EstimatedPath, noise: RadioNoiseConfig) -> dict[str, Any] | None:
-    """The beacon to range to, the place on the path where, and what that gives; None with fewer than three beacons."""
+    """The best beacon and place for the next range, and its effect; None with fewer than three beacons."""
     names, count = list(track.beacons), len(track.beacons)
     points = np.array([track.beacons[name][:2] for name in names]).reshape(-1, 2)
     places = track.poses[np.unique(np.linspace(0, len(track.poses) - 1, _PLACES).astype(int)), :2]
@@ -100,13 +100,13 @@ def next_reading(track: EstimatedPath, noise: RadioNoiseConfig) -> dict[str, Any
 
 
 def reviewed(run: RecordedRun, track: EstimatedPath, noise: RadioNoiseConfig) -> dict[str, Any]:
-    """What ``ccatp radio slam`` says besides errors, as JSON has it."""
+    """Residuals and the best next measurement, for JSON of ``ccatp radio slam``."""
     residuals = residuals_by_beacon(run, range_residuals(run, track, noise.camera_field_rad))
     return {"residuals": residuals, "measure_next": next_reading(track, noise)}
 
 
 def review_lines(data: Mapping[str, Any]) -> Iterator[str]:
-    """The same for people."""
+    """The data of ``reviewed`` as lines of text."""
     if data["residuals"]:
         yield ""
         yield f"{'beacon':<8} {'ranges':>9} {'median_m':>9} {'sigma_m':>8}"
