@@ -9,9 +9,9 @@ from typing import NamedTuple, Protocol
 
 
 class DeviceCheck(NamedTuple):
-    """What one device said of itself.
+    """Result of the check of one device.
 
-    ``found``: it answered; ``passed``: it is what it should be, and its rate and noise are in their limits.
+    ``found``: it could be opened; ``passed``: besides, it has no fault, and its rate and noise are within their limits.
     """
 
     device: str
@@ -24,14 +24,14 @@ class DeviceCheck(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Samples that came since the last call, each list oldest first.
+    """Samples since the last call, each list oldest first.
 
     imu: (t, acceleration along robot x, rate about robot z, acceleration along robot y), m/s^2 without gravity, rad/s.
     counts: (t, right, left) encoder counts since the start, unwrapped; ``None`` is a wheel that was not read.
     edges: (t, front left, front right, rear left, rear right) of the analogue edge sensors, V.
-    gravity: (t, gx, gy, gz), unit vector along which things fall, robot frame; the newest one, or none.
+    gravity: (t, gx, gy, gz), unit vector of gravity (down), robot frame; the newest one, or none.
     soc: state of charge of the battery, 0 to 1.
-    faults: what does not work now, by its name on the robot link, with the reason.
+    faults: reason of each present fault, by the fault's name on the robot link.
     """
 
     imu: Sequence[tuple[float, float, float, float]]
@@ -43,27 +43,27 @@ class Readings(NamedTuple):
 
 
 class HardwareError(Exception):
-    """A device is missing, refuses, or is another one; says which, why, and what to do."""
+    """A device is missing, fails, or is not the expected one; the text says which, why, and what to do."""
 
 
 class Hardware(Protocol):
-    """The devices. No call waits longer than the fraction of a millisecond that a register takes."""
+    """The devices. Only ``start`` and ``close`` may wait; the other calls take a fraction of a millisecond."""
 
     def start(self) -> None:
         """Open and set up every device; the motors brake, the fans stay as they are. Raises ``HardwareError``."""
 
     def read(self, now_s: float) -> Readings:
-        """What came since the last call, at ``now_s``."""
+        """The samples since the last call; ``now_s`` is the time of this call."""
 
     def drive(self, right_v: float, left_v: float) -> None:
-        """Motor voltages, V, positive drives forwards; each call also restarts the external timer.
+        """Set the motor voltages, V, positive drives forwards; each call also restarts the external timer.
 
-        The external timer short-brakes both motors by itself when no call comes for its time. ``HardwareError``: a
-        motor could not be set.
+        The external timer short-brakes both motors when it expires. Raises ``HardwareError`` if a motor could not be
+        set.
         """
 
     def brake(self) -> None:
-        """Short-brake both motors, and let the external timer run."""
+        """Short-brake both motors without a restart of the external timer."""
 
     def fans(self) -> tuple[float, float]:
         """Duties (left, right), 0 to 1, as read back from the devices. Raises ``HardwareError``."""

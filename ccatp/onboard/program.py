@@ -1,8 +1,8 @@
-"""The process of the on-board program: the link's server and the control loop in one thread, the service manager.
+"""The process of the on-board program: the link's server, the control loop, messages to the service manager.
 
 One event loop does everything: at ``servo.loop_hz`` it runs the wheels, and after the step that completes a frame it
-sends the frame. Only the inertial unit, whose bus may hang, is read in a thread of its own. What stops this process
-stops the external timer's signal, which brakes the motors.
+sends the frame. Only the inertial unit, whose bus may hang, is read in a thread of its own. If this process stops, it
+no longer restarts the external timer, which then brakes the motors.
 """
 
 import asyncio
@@ -26,8 +26,8 @@ from ccatp.onboard.server import TcpRobotServer
 
 PRIORITY = 40  # of SCHED_FIFO, where permitted: below the kernel's own interrupt threads (50)
 _BIN_S, _BINS = 1e-5, 10_000
-_WATCHDOG_SHARE = 0.25  # of the watchdog's period, between two signs of life
-_REPORT_S = 10.0  # a fault that flickers is logged at most so often
+_WATCHDOG_SHARE = 0.25  # interval of the watchdog messages / watchdog's period
+_REPORT_S = 10.0  # least time between two log lines of an intermittent fault
 
 _CLOCK_MONOTONIC, _CLOEXEC, _NONBLOCK = 1, os.O_CLOEXEC, os.O_NONBLOCK
 
@@ -39,9 +39,9 @@ class _Spec(ctypes.Structure):
 
 
 class PeriodicTimer:
-    """Calls ``call`` in the event loop every ``period_s`` until ``close``; periods that were missed are one call.
+    """Calls ``call`` in the event loop every ``period_s`` until ``close``; several missed periods give one call.
 
-    A timer of the kernel as a file descriptor: the event loop's own timers are a millisecond coarse.
+    It is a kernel timer with a file descriptor, because the event loop's timers have a resolution of a millisecond.
     """
 
     def __init__(self, period_s: float, call: Callable[[], None]) -> None:
@@ -59,7 +59,7 @@ class PeriodicTimer:
         self._call()
 
     def close(self) -> None:
-        """No more calls."""
+        """Stop the calls."""
         if self._fd >= 0:
             self._loop.remove_reader(self._fd)
             os.close(self._fd)
@@ -68,7 +68,7 @@ class PeriodicTimer:
 
 @dataclass
 class Lateness:
-    """By how much the steps of a loop came later than a period after the one before: a histogram of bounded size."""
+    """Histogram, of bounded size, of the delay of each step of a loop: time since the last step minus the period."""
 
     counts: list[int] = field(default_factory=lambda: [0] * _BINS)
     steps: int = 0
@@ -81,7 +81,7 @@ class Lateness:
         self.largest_s = max(self.largest_s, late_s)
 
     def percentile_s(self, share: float) -> float:
-        """No more than this late was that share of the steps, to within a bin."""
+        """The delay that this share of the steps did not exceed, to within a bin."""
         left = share * self.steps
         for k, count in enumerate(self.counts):
             left -= count
@@ -91,7 +91,7 @@ class Lateness:
 
 
 class OnboardServer(TcpRobotServer):
-    """The link's server of the robot itself. Its clock is that of the computer since ``boot_s`` (of ``monotonic``).
+    """The server of the robot link on the robot. Its clock is the computer's ``monotonic`` clock since ``boot_s``.
 
     Attributes:
         lateness: of the control loop.
@@ -119,7 +119,7 @@ class OnboardServer(TcpRobotServer):
         self.each_step: list[Callable[[OnboardRobot, float], None]] = []
 
     def begin(self, now_s: float) -> None:
-        """The robot boots; samples have been taken since ``boot_s``."""
+        """Start the server; the robot's clock counts from ``boot_s``, since samples have that time."""
         super().begin(self._started_s)
         self._clock_s = now_s
 
@@ -138,7 +138,7 @@ class OnboardServer(TcpRobotServer):
             self.fail(error)
 
     def step(self, now_s: float) -> None:
-        """Run the wheels, and send the frame that is complete."""
+        """Run the wheels, and send the frame if it is due."""
         robot = self.robot
         self.lateness.add(now_s - self._clock_s - self._step_s)
         self._clock_s = now_s
@@ -151,7 +151,7 @@ class OnboardServer(TcpRobotServer):
             call(robot, now_s)
 
     def _skip_stop(self, now_s: float) -> float:
-        # The clock of samples and frames is one, and goes on while the process stands.
+        # Samples and frames have the same clock, which continues while the process is stopped.
         return now_s - self.next_frame_s
 
     def _advance_robot(self) -> None:
@@ -175,7 +175,7 @@ async def serve(
     boot_s: float,
     *each_step: Callable[[OnboardRobot, float], None],
 ) -> None:
-    """Run the robot on hardware that was started, until ``stop`` is set; each of ``each_step`` is called as often."""
+    """Run the robot on started hardware until ``stop`` is set; call ``each_step`` after each step of the loop."""
     notifier, watchdog_s = take_from(os.environ)
     robot = OnboardRobot(cfg, hardware)
     server = OnboardServer(
@@ -190,13 +190,13 @@ async def serve(
         period_s, sent_s = _WATCHDOG_SHARE * watchdog_s, [0.0]
 
         def stroke(_: OnboardRobot, now_s: float) -> None:
-            # Out of the control loop: a loop that hangs must not be said to live.
+            # Sent from the control loop, so that the messages end when this loop hangs.
             if now_s - sent_s[0] >= period_s:
                 sent_s[0] = now_s
                 notifier.send("WATCHDOG=1")
 
         server.each_step.append(stroke)
-    # A collection in the middle of a step would be the longest delay of all.
+    # The collector does not scan frozen objects, so that a collection delays a step less.
     gc.collect()
     gc.freeze()
     port = await server.start(listener)
@@ -224,7 +224,7 @@ def run(
     key: bytes | None,
     log: structlog.typing.FilteringBoundLogger,
 ) -> int:
-    """The program until SIGTERM or SIGINT; ``make_hardware`` gets the robot's clock. Raises ``HardwareError``."""
+    """Run until SIGTERM, SIGINT or SIGHUP; ``make_hardware`` gets the robot's clock. Raises ``HardwareError``."""
     loop = asyncio.new_event_loop()
     boot_s = time.monotonic()
     hardware = make_hardware(lambda: time.monotonic() - boot_s)

@@ -1,15 +1,15 @@
-"""The robot behind its link, on its own computer: commands to motor voltages, samples to frames. Time is an argument.
+"""The robot on its own computer: converts commands to motor voltages and samples to frames. Time is an argument.
 
-Two rates: ``control`` runs the wheels, ``servo.loop_hz`` times a second; ``advance`` closes a frame. What the link
-demands of the robot is in ``ccatp.onboard.rules``; besides, the wheels are held while
+``control`` runs the wheels, ``servo.loop_hz`` times a second; ``advance`` closes a frame. ``ccatp.onboard.rules``
+contains the rules of the link. In addition, the wheels are held while
 
 * a device that is needed to drive has failed (inertial unit, encoders, edge sensors), until it works again;
-* a wheel is stalled, until a drive of zero;
+* a wheel is stalled, until the set points of the rules are zero;
 * the control loop ran so late that the external timer may have braked, for that step;
-* the robot slides over its wheels, and for half a second after: then the fans give all they can, until they are
-  commanded again.
+* the robot slides over its wheels, and for half a second after: then the fans run at full duty until the next fan
+  command.
 
-Nothing else changes the fans.
+Otherwise only fan commands change the fans.
 """
 
 from math import inf, pi
@@ -22,7 +22,7 @@ from ccatp.onboard.hardware import Hardware, HardwareError
 from ccatp.onboard.rules import HELD, LinkedRobot, SlideMonitor
 from ccatp.onboard.wheel_servo import WheelServo
 
-# Without these the robot does not move. A weak fan or battery is for its clients to judge.
+# Without these the robot does not move. Its clients decide what to do about a weak fan or battery.
 NEEDED = ("imu", "encoder_right", "encoder_left", "edge", "stall")
 _SAME_S = 1e-9
 _SLIDE_HOLD_S = 0.5
@@ -33,10 +33,10 @@ Row = TypeVar("Row", bound=tuple[Any, ...])
 
 
 class EdgeThreshold:
-    """From the voltage of one analogue edge sensor to a bit: threshold, hysteresis, debouncing.
+    """Converts the voltage of one analogue edge sensor to a bit: threshold, hysteresis, debouncing.
 
-    A sensor that changes to *no panel* counts from the first sample: a late report of the rim costs way. The change
-    back must last for ``debounce_s``. Before the first sample, which decides at once, there is no panel.
+    A change to *no panel* takes effect with its first sample, because a late report of the rim lengthens the stopping
+    distance. The change back must last for ``debounce_s``. The first sample takes effect at once.
     """
 
     def __init__(self, cfg: EdgeThresholdConfig) -> None:
@@ -45,11 +45,11 @@ class EdgeThreshold:
         half_v = 0.5 * cfg.hysteresis_v
         self._on_v, self._off_v = sign * cfg.threshold_v + half_v, sign * cfg.threshold_v - half_v
         self._is_on = False
-        # A sensor that is first read above has been there for ever.
+        # A first sample above the threshold is not debounced.
         self._above_since_s: float | None = -inf
 
     def read(self, t_s: float, voltage_v: float) -> int:
-        """1 = panel under the sensor, 0 = none; what is not a number is no panel."""
+        """1 = panel under the sensor, 0 = no panel; NaN gives 0."""
         level_v = self._sign * voltage_v
         if self._is_on:
             self._is_on = level_v >= self._off_v
@@ -67,10 +67,10 @@ class OnboardRobot(LinkedRobot):
     """The robot; ``hardware`` has been started.
 
     Attributes:
-        faults: what does not work now, by its name on the link, with the reason.
+        faults: reason of each present fault, by its name on the link or ``motors``.
         voltages_v: of the (right, left) motor.
-        late_steps: steps of the control loop that came later than the external timer waits.
-        dropped_samples: samples that were left out: a frame had too many, or they arrived after their frame.
+        late_steps: steps of the control loop that came later after the last one than the external timer waits.
+        dropped_samples: samples in no frame: a frame had too many, or they arrived after their frame.
     """
 
     def __init__(self, cfg: OnboardConfig, hardware: Hardware, commands_delay_frames: int = 0) -> None:
@@ -92,13 +92,13 @@ class OnboardRobot(LinkedRobot):
         self._control_s: float | None = None
         self._soc, self._stall = 1.0, ""
         self._line = b""
-        # Samples that no frame has held yet.
+        # Samples that are not in a frame yet.
         self._imu: list[tuple[float, float, float]] = []
         self._enc: list[WheelRates] = []
         self._edge: list[tuple[float, int, int, int, int]] = []
         self._gravity: tuple[float, float, float, float] | None = None  # of no frame yet
         self._downhill: tuple[float, float, float, float] | None = None
-        # The duties of before are in force; the floor comes with the first command.
+        # The fans keep their duties; the floor applies from the first command.
         self.fans.duty = self._duty_in_force = hardware.fans()
 
     def describe(self) -> RobotData:
@@ -111,7 +111,7 @@ class OnboardRobot(LinkedRobot):
     # -- the wheels ---------------------------------------------------------------------------------------------------
 
     def control(self, now_s: float) -> None:
-        """Read the devices and give the motors their voltages, at ``now_s`` of the robot's clock."""
+        """Read the devices and set the motor voltages and fans, at ``now_s`` of the robot's clock."""
         last_s, self._control_s = self._control_s, now_s
         self._take_readings(now_s)
         dt_s = 1.0 / self._cfg.servo.loop_hz if last_s is None else now_s - last_s
@@ -131,7 +131,7 @@ class OnboardRobot(LinkedRobot):
             self.rules.is_held = True
         try:
             if is_late or "encoder_right" in self.faults or "encoder_left" in self.faults:
-                # A servo that does not see its wheel would drive it at any speed.
+                # Without an encoder the servo could drive its wheel at any speed.
                 self._brake()
             else:
                 self.voltages_v = right.step(dt_s, right_set), left.step(dt_s, left_set)
@@ -168,7 +168,7 @@ class OnboardRobot(LinkedRobot):
                 self.fans.command(1.0, 1.0)
 
     def _count(self, t_s: float, right: int | None, left: int | None) -> None:
-        """Speeds from the counts since the reading before: their sum over time is the angle exactly."""
+        """Compute wheel speeds from the counts since the last reading; their integral is exactly the angle."""
         last, self._last_counts = self._last_counts, (t_s, right, left)
         for servo, count in zip(self._servos, (right, left), strict=True):
             if count is not None:
@@ -177,7 +177,7 @@ class OnboardRobot(LinkedRobot):
             return
         dt_s = t_s - last[0]
         if dt_s > self._cfg.devices.daq.timeout_s:
-            return  # a gap: how fast the wheels were within it is not known
+            return  # a gap: the wheel speeds within it are not known
         rates = [
             None if now is None or before is None else (now - before) * self._rad_per_count / dt_s
             for now, before in ((right, last[1]), (left, last[2]))
@@ -198,14 +198,14 @@ class OnboardRobot(LinkedRobot):
     # -- frames -------------------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
-        """Close a frame with every sample since the one before."""
+        """Close the next frame with every sample since the last one."""
         self.seq += 1
         self._close_frame(self.seq / self.frame_hz)
 
     def advance_to(self, now_s: float) -> None:
-        """Close the frame that is due at ``now_s``; frames that a stop of this computer left out are not made up for.
+        """Close the frame that is due at ``now_s``; frames that were missed in a stop of this computer are skipped.
 
-        Its time is ``sample_latency_s`` ago, so that it holds every sample since the frame before.
+        Its time is ``sample_latency_s`` ago, so that it contains every sample since the last frame.
         """
         t_s = max(now_s - self._cfg.link.sample_latency_s, self.t_s + 0.1 * self.frame_s)
         self.seq = max(self.seq + 1, int(now_s * self.frame_hz + 1e-6))
@@ -214,7 +214,7 @@ class OnboardRobot(LinkedRobot):
     def _close_frame(self, t_s: float) -> None:
         since_s, self.t_s = self.t_s, t_s
         drive_seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
-        # A motor that cannot be set is to the clients what a stalled one is.
+        # Clients see a motor that cannot be set as a stalled motor.
         faults = tuple(sorted({"stall" if name == "motors" else name for name in self.faults}))
         gravity = self._gravity if self._gravity is not None and self._gravity[0] <= t_s + _SAME_S else None
         if gravity is not None:
@@ -229,7 +229,7 @@ class OnboardRobot(LinkedRobot):
         self.delivered_seq = self.seq
 
     def _take_samples(self, samples: list[Row], since_s: float) -> list[Row]:
-        """The samples of the frame; later ones stay."""
+        """Remove and return the samples of the frame; later ones stay in ``samples``."""
         end = next((k for k, row in enumerate(samples) if row[0] > self.t_s + _SAME_S), len(samples))
         due, samples[:] = samples[:end], samples[end:]
         found = [row for row in due if row[0] > since_s + _SAME_S or not since_s][-_LINE_SAMPLES:]

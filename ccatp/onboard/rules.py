@@ -1,6 +1,6 @@
 """The rules that a robot enforces by itself, and the commands that it takes; time is an argument.
 
-It enforces by itself, whatever its clients do: drive and permit, time-to-live, directions, newest only. Deny by
+The rules do not depend on its clients: drive and permit, time-to-live, directions, newest only. Motion is denied by
 default: a set point reaches the wheels only through ``MotionRules.set_points``.
 """
 
@@ -23,8 +23,8 @@ class MotionRules:
 
     Wheels turn only while the newest drive is at most ``ttl_s`` old and, once a monitor has joined in this boot, the
     newest permit is at most ``ttl_s`` old and allows the direction: v = r (wr + wl)/2 > 0 needs ``forward``, < 0
-    ``reverse``, wr != wl or a steering angle needs ``turn``. A drive over ``max_wheel_rad_s`` is slowed down as a
-    whole, so that its path stays the same.
+    ``reverse``, wr != wl or a steering angle needs ``turn``. For a drive over ``max_wheel_rad_s`` both speeds are
+    scaled by the same factor, so that its path stays the same.
 
     Attributes:
         is_held: the last ``set_points`` held the wheels.
@@ -36,29 +36,29 @@ class MotionRules:
         self._drive: tuple[float, float] | None = None
         self._permit: tuple[bool, bool, bool] | None = None
         self._drive_seq = 0
-        self._drive_s = self._permit_s = inf  # no age before the first of the boot
+        self._drive_s = self._permit_s = inf  # before the first of the boot: gives the age 0
         self.steer_rad = 0.0
         self.has_monitor_joined = False
         self.is_held = True
 
     def lose(self, role: Role) -> None:
-        """Nothing that a role sent is in force any more."""
+        """Cancel the command of a role."""
         if role == "controller":
             self._drive = None
         else:
             self._permit = None
 
     def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float, steer_rad: float = 0.0) -> None:
-        """A drive that arrived at ``now_s``."""
+        """Take a drive that arrived at ``now_s``."""
         fastest = max(abs(right_rad_s), abs(left_rad_s))
         if fastest > self._max_wheel_rad_s:
             scale = self._max_wheel_rad_s / fastest
             right_rad_s, left_rad_s = scale * right_rad_s, scale * left_rad_s
-        self._drive = (float(right_rad_s), float(left_rad_s))  # one number of numpy's would slow down all that follows
+        self._drive = (float(right_rad_s), float(left_rad_s))  # a numpy number would slow down the computations
         self._drive_seq, self._drive_s, self.steer_rad = seq, now_s, steer_rad
 
     def permit(self, forward: bool, reverse: bool, turn: bool, now_s: float) -> None:
-        """A permit that arrived at ``now_s``."""
+        """Take a permit that arrived at ``now_s``."""
         self._permit, self._permit_s = (forward, reverse, turn), now_s
 
     def set_points(self, until_s: float) -> tuple[float, float]:
@@ -68,7 +68,7 @@ class MotionRules:
         return HELD if drive is None or self.is_held else drive
 
     def _may_move(self, drive: tuple[float, float], until_s: float) -> bool:
-        # Times are multiples of the frame period: an age of exactly the time-to-live must not fail for its last bit.
+        # Times are multiples of the frame period: rounding must not reject an age of exactly the time-to-live.
         limit_s = self._ttl_s + 1e-9
         if until_s - self._drive_s > limit_s:
             return False
@@ -91,13 +91,13 @@ class MotionRules:
 
 
 class FanRules:
-    """Fan duties: in force until changed by a newer command, never by time or by a lost session.
+    """Fan duties. Only a newer command changes them, never time or a lost session.
 
-    No duty below ``floor`` is accepted (0 = no floor); the fans start there.
+    A duty below ``floor`` is raised to it (0 = no floor); the fans start there.
 
     Attributes:
         duty: (left, right), 0 to 1.
-        health: (left, right) share of the thrust that comes out, 1 = sound.
+        health: (left, right) actual thrust / nominal thrust.
     """
 
     def __init__(self, floor: float) -> None:
@@ -106,7 +106,7 @@ class FanRules:
         self.health = (1.0, 1.0)
 
     def command(self, left: float, right: float) -> None:
-        """Set the duties, clamped to the floor."""
+        """Set the duties, clamped to between the floor and 1."""
         self.duty = (min(max(left, self._floor), 1.0), min(max(right, self._floor), 1.0))
 
     @property
@@ -116,9 +116,10 @@ class FanRules:
 
 
 class SlideMonitor:
-    """Loss of grip by the robot's own sensors: accelerations ahead and to the left, gyroscope, gravity, wheels.
+    """Detects loss of grip from accelerations ahead and to the left, gyroscope, gravity and wheels.
 
-    Their mean of 1 s is no slide: errors of the sensors and of the gravity that was taken out of the accelerations.
+    The running mean over 1 s of inertial minus wheel values is subtracted, because it comes from errors of the sensors
+    and of the removed gravity.
     """
 
     def __init__(self, limits: tuple[float, float], wheel_radius_m: float, wheel_base_m: float) -> None:
@@ -134,7 +135,7 @@ class SlideMonitor:
         angles_rad: tuple[float | None, float | None],
         gravity: tuple[float, float, float, float] | None,
     ) -> bool:
-        """Take a sample of the inertial unit and the (right, left) angles of the wheels; whether the robot slides."""
+        """Take an inertial sample and the (right, left) wheel angles; true if the robot slides."""
         rule, last, (t_s, ax, wz, ay), (right, left) = self._rule, self._last, sample, angles_rad
         self._last = None if right is None or left is None else (t_s, right, left)
         if (
@@ -168,13 +169,13 @@ class SlideMonitor:
 class LinkedRobot(ABC):
     """Roles, commands and the newest frame (``seq``, ``t_s`` on the robot's clock) of a robot behind its link.
 
-    A command that arrives while frame n is the newest takes effect in the frame that follows n + the delay of the
-    commands, in whole frames. Its age counts from its arrival, so the time-to-live covers the delay, too. Whether it is
-    newer than the one before is decided when it arrives; sequence numbers count per kind and session.
+    A command that arrives while frame n is the newest takes effect in frame n + 1 + ``commands_delay_frames``. Its age
+    counts from its arrival, so the time-to-live includes the delay. Its sequence number is compared with the one before
+    when it arrives; sequence numbers count per kind and session.
 
     Attributes:
-        delivered_seq: number of the frame that reached the clients at this instant; -1 while none has, or a fault took
-            it.
+        delivered_seq: number of the frame that reached the clients at this instant; -1 before the first, or if a fault
+            removed it.
     """
 
     is_steerable = False
@@ -190,7 +191,7 @@ class LinkedRobot(ABC):
         self._boot()
 
     def _boot(self) -> None:
-        """Rules without any command; the fans at their floor."""
+        """Start the rules without any command, with the fans at their floor."""
         ttl_s, max_wheel_rad_s, fan_floor = self._limits
         self.rules = MotionRules(ttl_s, max_wheel_rad_s)
         self.fans = FanRules(fan_floor)
@@ -203,7 +204,7 @@ class LinkedRobot(ABC):
 
     @abstractmethod
     def describe(self) -> RobotData:
-        """What the hello says of the robot."""
+        """The robot's data in the hello message."""
 
     @property
     def next_t_s(self) -> float:
@@ -213,9 +214,9 @@ class LinkedRobot(ABC):
     @property
     @abstractmethod
     def delivered_line(self) -> bytes:
-        """That frame as a line with its LF; empty while none has reached the clients.
+        """Frame ``delivered_seq`` as a line with its LF; empty before the first.
 
-        With faults it is whatever leaves the robot at this instant: nothing, a line that none may take, several lines.
+        With faults it contains all bytes that leave the robot at this instant: nothing, an invalid line, several lines.
         """
 
     @abstractmethod
@@ -223,7 +224,7 @@ class LinkedRobot(ABC):
         """Drive one frame and read the sensors."""
 
     def join(self, role: Role) -> None:
-        """A new session has a role; fan duties of the controller before, already accepted, come into force."""
+        """Give a role to a new session; delayed fan duties of the previous controller take effect at once."""
         if role == "controller":
             for _, kind, _, values in self._waiting:
                 if kind == "fans":
@@ -234,7 +235,7 @@ class LinkedRobot(ABC):
         self.lose(role)
 
     def lose(self, role: Role) -> None:
-        """The session of a role has ended: hold. Fan duties stay."""
+        """End the session of a role: its command is cancelled, so the wheels are held. Fan duties stay."""
         self._forget(_MOTION[role])
         self.rules.lose(role)
 
@@ -285,6 +286,6 @@ class LinkedRobot(ABC):
             self.fans.command(*values)
 
     def _release_commands(self) -> None:
-        """Apply what is due when the step after the newest frame begins."""
+        """Apply the commands that are due when the step after the newest frame begins."""
         while self._waiting and self._waiting[0][0] <= self.seq:
             self._apply(*self._waiting.popleft()[1:])

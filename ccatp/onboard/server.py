@@ -9,12 +9,12 @@ from ccatp.onboard.rules import LinkedRobot
 from ccatp.onboard.sessions import RobotServer, RobotSession, ServerLog
 
 HOUSEKEEPING_S = 0.25
-# A client that does not read gets no more frames once this much waits for it; it finds the newest when it reads on.
+# While more than this is unsent to a client that does not read, further frames for it are dropped.
 MAX_UNSENT_BYTES = 1 << 18
 
 
 class TcpRobotServer(RobotServer):
-    """The server of one robot; in lockstep its time waits for the clients, otherwise the wall clock paces it."""
+    """The server of one robot; the clients' answers advance its time in lockstep, the wall clock otherwise."""
 
     def __init__(
         self, robot: LinkedRobot, *, lockstep: bool, key: bytes | None = None, log: ServerLog | None = None
@@ -26,7 +26,7 @@ class TcpRobotServer(RobotServer):
         self._failure: asyncio.Future[None]
 
     async def start(self, listener: socket.socket) -> int:
-        """Boot and serve who connects to a listening socket; return its port."""
+        """Boot and serve the clients of a listening socket; return its port."""
         loop = asyncio.get_running_loop()
         self._failure = loop.create_future()
         self.begin(loop.time())
@@ -40,7 +40,7 @@ class TcpRobotServer(RobotServer):
         return Connection(self)
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Serve until ``stop`` is set; ``start`` first. An unforeseen error is raised here."""
+        """Serve until ``stop`` is set; call ``start`` first. Raises the error given to ``fail``."""
         failure = self._failure
         stopped = asyncio.ensure_future(stop.wait())
         try:
@@ -54,7 +54,7 @@ class TcpRobotServer(RobotServer):
             await self.close()
 
     async def close(self) -> None:
-        """Stop: no timer, no listener, no session."""
+        """Stop the timer, the listener and all sessions."""
         self._stop_timer()
         if self._listener is None:
             return
@@ -100,7 +100,7 @@ class Connection(RobotSession, asyncio.Protocol):
         self._clock = asyncio.get_running_loop().time
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
+        self._transport = cast(asyncio.Transport, transport)  # the type for TCP
         self._transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
         self._writer = LineWriter(self._transport)
         peer = self._transport.get_extra_info("socket")
@@ -116,7 +116,7 @@ class Connection(RobotSession, asyncio.Protocol):
             self._owner.fail(error)
 
     def eof_received(self) -> None:
-        # The transport closes only when the client has taken what waits for it; the session ends here and now.
+        # The transport closes only after it has sent the remaining bytes; the session ends now.
         self._owner.lost(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -130,7 +130,7 @@ class Connection(RobotSession, asyncio.Protocol):
         self._is_paused = False
 
     def write(self, data: bytes) -> None:
-        """Send, unless the client does not read."""
+        """Send, or drop ``data`` while the client does not read."""
         if not self._is_paused:
             self._writer.write(data)
 

@@ -1,22 +1,23 @@
 """The robot's side of the robot link without sockets: sessions, roles, refusals, lockstep.
 
-Bytes and time are arguments, the transport is whatever has ``write`` and ``close``. Two clocks: ``now_s`` is any
+Bytes and time are arguments; a transport implements ``write`` and ``close``. There are two clocks: ``now_s`` is any
 monotonic wall clock; the robot's own clock is the simulated one in lockstep and the wall clock since boot otherwise.
 
 Choices the interface leaves open:
 
-* Before the join a malformed line is dropped and counted as always; a wrong join and any other message are refused as
-  ``bad join``, and so is silence for ``JOIN_TIMEOUT_S``. ``busy`` means too many connections.
-* A message that does not belong to the sender's role is a bad line. Messages of unknown type keep no role alive.
-* In lockstep too the limits of sessions and roles are in wall time: a client that holds its answer back sends its last
-  one again meanwhile.
+* Before the join, a malformed line and a message of unknown type are dropped and counted as after it. A malformed join,
+  any other known message and no join within ``JOIN_TIMEOUT_S`` are refused as ``bad join``. ``busy`` means too many
+  connections.
+* A message that does not belong to the sender's role is a bad line. A message of unknown type keeps no role alive.
+* In lockstep too, the time limits of sessions and roles are in wall time. A client that delays its answer repeats its
+  last one meanwhile.
 * Sequence numbers start again with each session.
-* In lockstep a delay of the sensors keeps its length: each answer to the newest frame delivered drives one frame, and
-  delivers the next. What a client has is old by the delay, as it is on a wall clock. The frames before the first
-  delivery run when the controller joins, held. Delays within the robot stand in for those of the whole link.
-* In lockstep a frame that a fault took away, or that no client may take, is not waited for: simulated time goes on to
-  the next that can be answered, for at most ``NO_DELIVERY_S``; then the sessions are closed.
-* A reboot by plan closes every session.
+* In lockstep a delay of the sensors has a constant length: each answer to the newest delivered frame drives one frame
+  and delivers the next. A client's data are as old as the delay, as on a wall clock. The frames before the first
+  delivery run when the controller joins, with the wheels held. The robot's delays represent those of the whole link.
+* In lockstep the server does not wait for a frame that a fault removed or made invalid. Simulated time advances to the
+  next frame that can be answered, by at most ``NO_DELIVERY_S``; then the sessions are closed.
+* A planned reboot closes every session.
 """
 
 import secrets
@@ -45,7 +46,7 @@ from ccatp.onboard.rules import LinkedRobot
 
 JOIN_TIMEOUT_S = 2.0
 SILENCE_S = 5.0
-# Wall time in lockstep after which a frame without answers is sent again, is noted, and ends a silent client's session.
+# Wall times in lockstep: an unanswered frame is sent again, is logged, and a silent client's session is closed.
 REPEAT_S = 1.0
 STALL_S = 5.0
 LOCKSTEP_SILENCE_S = 60.0
@@ -55,19 +56,20 @@ MAX_SESSIONS = 32
 
 
 class ServerLog(Protocol):
-    """A structlog logger, or whatever has this method."""
+    """A structlog logger, or any object with this method."""
 
     def info(self, event: str, **fields: object) -> object:
-        """Take one line and its fields."""
+        """Log one line with its fields."""
 
 
 class RobotSession(ABC):
-    """One client; what sends its bytes is added by a transport.
+    """One client; a transport adds the sending of bytes.
 
     Attributes:
-        joined_s, received_s: when it connected and when it last sent something valid; wall clock, but for the latter in
-            real time: there a stop of the robot's own process is no silence of its clients.
-        is_open: not closed by us.
+        joined_s: when it connected; wall clock.
+        received_s: when it last sent a valid message; wall clock in lockstep, otherwise the robot's clock, so that a
+            stop of the robot's own process does not count as silence of its clients.
+        is_open: neither closed by the server nor lost.
     """
 
     def __init__(self, server: "RobotServer") -> None:
@@ -85,10 +87,10 @@ class RobotSession(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close when everything is sent; nothing is received any more."""
+        """Close when everything is sent; receive nothing more."""
 
     def receive(self, data: bytes, now_s: float) -> None:
-        """Take bytes as they come."""
+        """Process received bytes, which may be a part of a line."""
         for line in self._lines.feed(data):
             if self.is_open:
                 self._take(line, now_s)
@@ -115,12 +117,12 @@ class RobotSession(ABC):
 
 
 class RobotServer:
-    """The robot behind its link; ``begin`` first. Without a ``key`` of the HMAC there is no authentication.
+    """The server of the robot link; call ``begin`` first. Without an HMAC ``key`` there is no authentication.
 
     Attributes:
         counts: bad_lines, unknown_types, oversized_lines, refused, stale (drives, permits and fans not newer),
             slips (frames more than a period late), repeats (frames that were sent again in lockstep).
-        oldest_ack_frames: how many frames a drive that moves the robot was behind at most (not in lockstep).
+        oldest_ack_frames: largest age, in frames, of the frame acknowledged by a drive with a speed other than zero.
         each_frame: called after each frame that was driven and sent.
     """
 
@@ -141,11 +143,11 @@ class RobotServer:
         self._reboots = robot.reboots
 
     def begin(self, now_s: float) -> None:
-        """The robot boots."""
+        """Start the robot's clock at ``now_s``."""
         self._boot_s = self._frame_wall_s = self._repeated_s = now_s
 
     def accept(self, session: RobotSession, now_s: float) -> None:
-        """A client connected."""
+        """Send the hello to a client that has connected; refuse it when there are too many sessions."""
         session.joined_s = session.received_s = now_s
         auth, boot = AUTH_NONE if self._key is None else AUTH_HMAC, self._boot + self._reboots
         session.write(encode(self.robot.hello(boot=boot, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep)))
@@ -154,7 +156,7 @@ class RobotServer:
             self.refuse(session, "busy")
 
     def lost(self, session: RobotSession) -> None:
-        """The connection of a session is gone (or shall be forgotten): its role is free, the wheels are held."""
+        """Remove a session whose connection is lost or will be closed: free its role and hold the wheels."""
         session.is_open = False
         self._sessions.discard(session)
         role, session.role = session.role, None
@@ -172,13 +174,13 @@ class RobotServer:
         session.close()
 
     def refuse(self, session: RobotSession, reason: RefusalReason) -> None:
-        """Refuse a role to a client, and close."""
+        """Refuse a role to a client and close its session."""
         self.counts["refused"] += 1
         session.write(encode(Refused(reason=reason)))
         self.drop(session, f"refused: {reason}")
 
     def check_time(self, now_s: float) -> None:
-        """Refuse who does not join; in lockstep see to a frame without answers. To be called a few times a second."""
+        """Refuse clients that do not join; in lockstep handle an unanswered frame. Call it a few times a second."""
         for session in tuple(self._sessions):
             if session.role is None and now_s - session.joined_s > JOIN_TIMEOUT_S:
                 self.refuse(session, "bad join")
@@ -197,8 +199,8 @@ class RobotServer:
             self._note(f"stall: frame {self.robot.delivered_seq} waits for its {missing}")
 
     def join(self, session: RobotSession, message: FromClient, now_s: float) -> None:
-        """A session that has no role yet sent its first message."""
-        # The round of `check_time` may come later than this message: the limit holds all the same.
+        """Handle the first message of a session that has no role yet."""
+        # `check_time` may run after this message, so the time limit is also checked here.
         if not isinstance(message, Join) or now_s - session.joined_s > JOIN_TIMEOUT_S:
             self.refuse(session, "bad join")
             return
@@ -231,7 +233,7 @@ class RobotServer:
             session.write(self.robot.delivered_line)
 
     def _run_to_delivery(self) -> None:
-        """No client can answer what is still on its way, or lost: the frames until one arrives run by themselves."""
+        """Run frames until one is delivered: no client can answer a frame that is delayed or lost."""
         robot, since_s = self.robot, self.robot.t_s
         while robot.delivered_seq < 0 and "controller" in self._holders:
             if robot.t_s - since_s > NO_DELIVERY_S:
@@ -240,7 +242,7 @@ class RobotServer:
             self._drive_frame()
 
     def command(self, session: RobotSession, role: Role, message: FromClient, now_s: float) -> bool:
-        """A message of a session that has a role; false when it is not for this role."""
+        """Handle a message of a session that has a role; false when the message is not for this role."""
         robot, robot_s = self.robot, self._robot_time_s(now_s)
         if type(message) is Drive and role == "controller":
             taken = robot.drive(message.seq, message.wr, message.wl, robot_s, message.steer or 0.0)
@@ -270,16 +272,16 @@ class RobotServer:
         return self._boot_s + self.robot.next_t_s
 
     def tick(self, now_s: float) -> None:
-        """Drive the frame that is due (not in lockstep). Late frames are made up for, one per call.
+        """Drive the frame that is due (not in lockstep). Late frames are driven afterwards, one per call.
 
-        After a longer stop of this process the robot's clock goes on where it stood, as if it had been off.
+        After a stop of this process over ``MAX_LAG_S`` the robot's clock continues from its value before the stop.
         """
         if self._skip_stop(now_s) > self.robot.frame_s:
             self.counts["slips"] += 1
         self._advance(now_s)
 
     def _skip_stop(self, now_s: float) -> float:
-        """Set the robot's clock back to where it stood before a longer stop; by how much the next frame is late, s."""
+        """Set the clock back to its value before a stop over ``MAX_LAG_S``; return the delay of the next frame, s."""
         late_s = now_s - self.next_frame_s
         if late_s <= MAX_LAG_S:
             return late_s
@@ -295,7 +297,7 @@ class RobotServer:
             self._run_to_delivery()
 
     def _drive_frame(self) -> None:
-        """Drive a frame and send it; what is kept of it is kept while the clients work on it."""
+        """Drive a frame, send it, then call ``each_frame``, which runs while the clients process the frame."""
         self._advance_robot()
         self._send_frame()
         for call in self.each_frame:
@@ -324,7 +326,7 @@ class RobotServer:
         robot_s = self.robot.t_s
         if self._is_lockstep:
             return robot_s
-        # A command that is read before the first frame after a stop must not count as one of the time to come.
+        # A command that is read before the first frame after a stop must not get a time in the future.
         self._skip_stop(now_s)
         return max(robot_s, now_s - self._boot_s)
 

@@ -1,9 +1,9 @@
 """Finds the parameters of the wheel servos by driving free wheels: friction, slope, time constant, gains.
 
-A geared DC motor obeys ``T dw/dt + w = (V - V_static sign(w)) / slope``. A staircase of voltages gives static voltage
-and slope of each wheel (least squares over both directions), a step its time constant. With the PI servo the speed
-error has the characteristic polynomial ``slope T s^2 + (slope + kp) s + ki``; both poles are placed at ``-w0``, with
-``w0 = POLES / response_s``. A step under the servo with these gains shows how well the wheel follows.
+A geared DC motor obeys ``T dw/dt + w = (V - V_static sign(w)) / slope``. Steps of constant voltage give the static
+voltage and slope of each wheel (least squares over both directions); a step from rest gives its time constant. With the
+PI servo the speed error has the characteristic polynomial ``slope T s^2 + (slope + kp) s + ki``; both poles are at -w0,
+``w0 = POLES / response_s``. A step with the servo and these gains then measures how well the wheel follows.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,20 +16,20 @@ from ccatp.config.onboard_models import WheelServoConfig
 from ccatp.onboard.hardware import Hardware, HardwareError
 from ccatp.onboard.wheel_servo import WheelServo
 
-POLES = 4.0  # the error decays this many times as fast as the set point is followed
+POLES = 4.0  # rate of decay of the speed error / rate at which the servo follows the set point
 _LEVELS = 8
 _HOLD_S, _SETTLED_S = 0.6, 0.3
 _MOVING_RAD_S = 0.2
 _TOP_SHARE = 0.8  # of the largest voltage
 _STEP_S = 0.8
 _STEP_SHARE = 0.5  # of the speed at the top voltage
-_MOST_DIFFERENCE = 0.1  # of the two wheels' slopes: beyond, one of them is not what the other is
+_MOST_DIFFERENCE = 0.1  # of the two wheels' slopes, relative to the larger one
 
 Trace = list[tuple[float, float, float]]
 
 
 class WheelTuning(NamedTuple):
-    """One wheel: static voltage, V; slope, V per rad/s; time constant, s; rms of its speed about a straight line, V."""
+    """One wheel: static voltage, V; slope, V per rad/s; time constant, s; rms residual of the straight line, V."""
 
     static_v: float
     volt_per_rad_s: float
@@ -38,10 +38,11 @@ class WheelTuning(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """What was found.
+    """Result of the tuning.
 
-    right, left: each wheel. values: keys of ``[servo]`` and what they should be. step: (time s, speed rad/s, reference
-    rad/s) of the right wheel under the servo with these values. deviation_rad_s: rms of speed less reference.
+    right, left: each wheel. values: new values of keys of ``[servo]``. step: (time s, speed rad/s, reference rad/s) of
+    the right wheel with the servo and these values. deviation_rad_s: rms of speed minus reference. overshoot_share:
+    largest speed / mean speed of the second half of the step - 1, at least 0.
     """
 
     right: WheelTuning
@@ -53,7 +54,7 @@ class Tuning(NamedTuple):
 
 
 class _Bench:
-    """Free wheels at given voltages."""
+    """Runs free wheels at given voltages."""
 
     def __init__(
         self, hardware: Hardware, cfg: WheelServoConfig, now: Callable[[], float], sleep: Callable[[float], None]
@@ -62,7 +63,7 @@ class _Bench:
         self.servos = WheelServo(cfg), WheelServo(cfg)
 
     def hold(self, duration_s: float, voltages: Callable[[float], tuple[float, float]]) -> list[tuple[float, ...]]:
-        """Apply ``voltages(dt)`` for a time; rows of (t, right, left speed)."""
+        """Apply ``voltages(dt)`` for a time; rows of (t, right, left speed), s and rad/s. Raises ``HardwareError``."""
         rows: list[tuple[float, ...]] = []
         start_s = last_s = self._now()
         while last_s - start_s < duration_s:
@@ -91,7 +92,7 @@ def tune(
 ) -> Tuning:
     """Tune both wheels, which must turn freely; ``hardware`` has been started. The motors brake at the end.
 
-    Raises ``HardwareError``: a wheel does not turn, turns the wrong way, or differs much from the other.
+    Raises ``HardwareError`` if a device fails or a wheel does not turn, turns the wrong way, or differs from the other.
     """
     bench = _Bench(hardware, cfg, now, sleep)
     try:
@@ -148,7 +149,7 @@ def _fit(speeds: Sequence[Sequence[float]], rises: Sequence[Sequence[float]], k:
 
 def _gains(found: Sequence[WheelTuning], cfg: WheelServoConfig) -> dict[str, float]:
     static_v, slope, time_s = (sum(one[k] for one in found) / len(found) for k in range(3))
-    # Speed is measured over a window, which delays it by half of that: no part of the motor's time constant.
+    # The speed is measured over a window; its delay of half the window is not part of the motor's time constant.
     time_s = max(time_s - 0.5 * cfg.speed_window_s, 1.0 / cfg.loop_hz)
     poles = POLES / cfg.response_s
     return {
@@ -164,7 +165,7 @@ def _show_step(bench: _Bench, cfg: WheelServoConfig, speed_rad_s: float) -> tupl
     rows = bench.hold(_STEP_S, lambda dt_s: (right.step(dt_s, speed_rad_s), left.step(dt_s, speed_rad_s)))
     trace = [(t_s, rate, speed_rad_s * (1.0 - exp(-t_s / cfg.response_s))) for t_s, rate, _ in rows]
     deviation = sqrt(sum((rate - wanted) ** 2 for _, rate, wanted in trace) / len(trace))
-    # The newest speeds lie in the middle of their window; the mean of some takes the counts' steps out.
+    # The mean of several speeds reduces the quantization error of the counts.
     tail = [rate for t_s, rate, _ in trace if t_s > 0.5 * _STEP_S]
     overshoot = max(max(rate for _, rate, _ in trace) / (sum(tail) / len(tail)) - 1.0, 0.0)
     return trace, deviation, overshoot

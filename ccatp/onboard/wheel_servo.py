@@ -1,12 +1,12 @@
-"""The speed controller of one wheel: from a set point and encoder counts to a motor voltage.
+"""The speed controller of one wheel: computes a motor voltage from a set point and encoder counts.
 
-The set point passes a first-order filter (time constant ``response_s``), so that the wheel follows it as the off-board
-computer expects, however strong its motor is. The wheel follows the filtered speed by feed-forward of the motor's
-steady state, V = static sign(w) + slope w, and PI. The integral of the speed error is the difference of two angles,
-which counts give without noise. The voltage is limited in size and slope; while it is, the reference angle does not run
-ahead (anti-windup by conditional integration).
+The set point passes a first-order filter (time constant ``response_s``), so that the response of the wheel is the one
+that the off-board computer expects, independent of the motor. The wheel follows the filtered speed by feed-forward of
+the motor's steady state, V = static sign(w) + slope w, and PI. The integral of the speed error is the difference of two
+angles, which counts give without noise. The voltage and its rate of change are limited; while a limit is active, the
+reference angle does not move further ahead (anti-windup by conditional integration).
 
-A set point of zero brakes at once: the filtered speed decays, and the angle at which the wheel comes to rest is held.
+With a set point of zero the filtered speed decays to zero; then the servo holds the reference angle.
 """
 
 from collections import deque
@@ -14,7 +14,7 @@ from math import copysign, exp, pi
 
 from ccatp.config.onboard_models import WheelServoConfig
 
-_REST_RAD_S = 0.02  # slower than this with a set point of zero, the wheel is to stay where it is
+_REST_RAD_S = 0.02  # below this speed a wheel, or its reference with a set point of zero, is at rest
 
 
 class WheelServo:
@@ -22,7 +22,7 @@ class WheelServo:
 
     Attributes:
         rate_rad_s: measured speed over ``speed_window_s``.
-        voltage_v: what the motor was given last.
+        voltage_v: the last voltage.
     """
 
     def __init__(self, cfg: WheelServoConfig) -> None:
@@ -31,7 +31,7 @@ class WheelServo:
         self._window: deque[tuple[float, int]] = deque()
         self.rate_rad_s = self.voltage_v = 0.0
         self._reference_rad_s = 0.0
-        self._ahead_rad = 0.0  # reference angle less the wheel's
+        self._ahead_rad = 0.0  # reference angle minus the wheel's
         self._last_count: int | None = None
         self._stalled_s = 0.0
 
@@ -63,7 +63,7 @@ class WheelServo:
         ahead_rad = self._ahead_rad + way_rad
         wanted_v = cfg.volt_per_rad_s * reference + cfg.proportional_v_per_rad_s * (reference - self.rate_rad_s)
         wanted_v += cfg.integral_v_per_rad * ahead_rad
-        if reference:  # at rest friction is on the side of the brake
+        if reference:  # at rest, friction helps to hold the wheel
             wanted_v += copysign(cfg.static_v, reference)
         most_v = cfg.slew_v_s * dt_s
         voltage_v = min(max(wanted_v, self.voltage_v - most_v), self.voltage_v + most_v)
@@ -81,6 +81,6 @@ class WheelServo:
         return self._stalled_s >= self._cfg.stall_s
 
     def release(self) -> None:
-        """The motor is braked by other means: nothing of the past pushes it afterwards."""
+        """Reset voltage, reference, integral and stall time; the motor is braked by other means."""
         self.voltage_v = self._reference_rad_s = self._ahead_rad = 0.0
         self._stalled_s = 0.0

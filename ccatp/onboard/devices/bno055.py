@@ -1,12 +1,12 @@
 """The inertial unit Bosch BNO055 on an I2C bus: set-up, readings, and the thread that takes them.
 
 In its mode IMU the unit fuses gyroscope and accelerometer at 100 Hz. The register UNIT_SEL is set to 0x02: 1/100 m/s^2
-and 1/900 rad/s per LSB. The unit itself turns its axes to those of the robot (x forward, y left, z away from the
-surface) by its axis registers. Its gravity vector is what an accelerometer at rest shows, so it points up: the vector
-along which things fall is the opposite one. Source: data sheet BST-BNO055-DS000-14.
+and 1/900 rad/s per LSB. The axis registers of the unit map its axes to those of the robot (x forward, y left, z away
+from the surface). Its gravity vector is what an accelerometer at rest shows: it points up, so it is negated here.
+Source: data sheet BST-BNO055-DS000-14.
 
-The unit stretches the clock of the bus. A controller that does not wait for it reads wrong bits, the highest of a byte
-most of all: on a Raspberry Pi, use the overlay i2c-gpio.
+The unit stretches the clock of the bus. A bus controller that does not support this reads wrong bits, mostly the
+highest bit of a byte; on a Raspberry Pi, use the overlay i2c-gpio.
 """
 
 import struct
@@ -40,30 +40,30 @@ TO_CONFIG_S, FROM_CONFIG_S = 0.019, 0.007
 BURST_START = 0x14
 BURST = struct.Struct("<16h10B")
 _G_M_S2 = 9.80665  # of the unit's fusion
-_MISFIT = 0.05  # of the length of quaternion and gravity; with bytes of two readings it is more
+_MISFIT = 0.05  # largest relative error of the lengths of quaternion and gravity; mixed bytes of two readings exceed it
 _MOST_RAD_S, _MOST_M_S2 = 35.0, 80.0  # ranges of the sensors: 2,000 deg/s; 4 g, and as much for gravity
 
 REOPEN_AFTER, RESET_AFTER = 3, 10  # failures in sequence
 LONGEST_WAIT_S = 1.0
-_QUEUED = 64  # samples that wait for the reader: more than half a second
-_JOIN_S = 0.2  # a transfer that hangs in the kernel ends with the process
+_QUEUED = 64  # samples in the queue to the reader: more than half a second
+_JOIN_S = 0.2  # a thread that hangs longer in the kernel ends with the process
 
 
 class Bus(Protocol):
     """An I2C bus. Both transfers raise OSError."""
 
     def write(self, address: int, data: bytes) -> None:
-        """Write register and values."""
+        """Write a register number and values."""
 
     def write_read(self, address: int, data: bytes, count: int) -> bytes:
-        """Write a register, repeated start, read ``count`` bytes from there on."""
+        """Write a register number, then after a repeated start read ``count`` bytes from this register on."""
 
     def close(self) -> None:
         """Release it."""
 
 
 class _DoubtfulReading(Exception):
-    """A transfer went well, but what came is no new reading."""
+    """A transfer succeeded, but its bytes are not a valid new reading."""
 
 
 class Bno055Sample(NamedTuple):
@@ -72,14 +72,14 @@ class Bno055Sample(NamedTuple):
     t_s: float
     ax_m_s2: float
     wz_rad_s: float
-    gravity: tuple[float, float, float]  # unit vector along which things fall
+    gravity: tuple[float, float, float]  # unit vector, down
     ay_m_s2: float = 0.0
 
 
 def axis_registers(axes: Sequence[str]) -> tuple[int, int]:
     """AXIS_MAP_CONFIG and AXIS_MAP_SIGN for the unit's axes along robot x, y, z.
 
-    Raises HardwareError: an axis twice, or axes as of a mirror image.
+    Raises HardwareError if an axis occurs twice or the axes are left-handed.
     """
     order = tuple("xyz".index(axis[-1]) for axis in axes)
     signs = sum((axis[0] == "-") << (2 - place) for place, axis in enumerate(axes))
@@ -95,11 +95,12 @@ def axis_registers(axes: Sequence[str]) -> tuple[int, int]:
 class Bno055:
     """The unit, read in a thread of its own, since a transfer takes a millisecond and may hang in the kernel.
 
-    After some failures in sequence the bus is opened again, after more the unit is reset, at growing intervals.
+    After ``REOPEN_AFTER`` failures in sequence the bus is opened again before each attempt, after every ``RESET_AFTER``
+    the unit is reset; the interval between the attempts grows.
 
     Attributes:
         errors: attempts that gave no sample.
-        identity: what the unit says of itself; its gyroscope calibrates itself while it stands.
+        identity: software version, and calibration level of the gyroscope, which calibrates itself at rest.
     """
 
     def __init__(self, config: Bno055Config, open_bus: Callable[[], Bus], clock: Clock, sleep: Sleep) -> None:
@@ -118,7 +119,7 @@ class Bno055:
         self.identity = ""
 
     def open(self) -> None:
-        """Set the unit up and begin to read. Raises HardwareError."""
+        """Set up the unit and start the thread. Raises HardwareError."""
         try:
             self._reopen_bus()
             self._set_up()
@@ -136,20 +137,20 @@ class Bno055:
         return taken
 
     def fault(self, now_s: float) -> str:
-        """Why there is no reading for too long; empty: there is one."""
+        """The reason if the newest reading is older than ``timeout_s``, otherwise empty."""
         age_s = now_s - self._newest_s
         if age_s <= self._config.timeout_s:
             return ""
         return f"no reading for {age_s:.2f} s: {self._reason or 'a transfer hangs; check the wiring of the I2C bus'}"
 
     def close(self) -> None:
-        """End the thread, which releases the bus; one that hangs in the kernel is left to itself."""
+        """End the thread, which releases the bus; a thread that hangs in the kernel is not waited for."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(_JOIN_S)
 
     def step(self) -> float:
-        """Take one reading, or try to get the unit to work again; after how long to call again, s."""
+        """Take one reading or try to recover the unit; return the time until the next call, s."""
         try:
             if self._failures >= REOPEN_AFTER:
                 self._reopen_bus()
@@ -186,7 +187,7 @@ class Bno055:
             self._close_bus()
 
     def _read(self) -> Bno055Sample:
-        """One burst. Raises OSError, _DoubtfulReading, and HardwareError where the unit has to be set up again."""
+        """Read one burst. Raises OSError, _DoubtfulReading, and HardwareError if the unit must be set up again."""
         t_s = self._clock()
         burst = self._read_registers(BURST_START, BURST.size)
         values = BURST.unpack(burst)
@@ -211,7 +212,7 @@ class Bno055:
         return Bno055Sample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz), ay / 100.0)
 
     def _set_up(self) -> None:
-        """Reset the unit and set what ``_read`` relies on, each value read back; takes about 0.7 s."""
+        """Reset the unit and write the settings that ``_read`` needs, each read back; takes about 0.7 s."""
         axis_map, axis_sign = axis_registers(self._config.axes)
         self._check_id()
         with suppress(OSError):  # it may reset before it acknowledges
@@ -239,7 +240,7 @@ class Bno055:
     def _check_id(self) -> None:
         try:
             self._write(PAGE_ID, 0)
-        except OSError:  # its supply may have come a moment ago
+        except OSError:  # it may just have been powered on
             self._sleep(POWER_ON_S)
             self._write(PAGE_ID, 0)
         if (found := self._read_registers(CHIP_ID, 1)[0]) != BNO055_ID:

@@ -25,9 +25,9 @@ Frames both ways, little endian, at most 264 bytes::
     12      4 u16   edge sensors front left, front right, rear left, rear right: 0 to 65535 for 0 V to full scale
     20      u16     battery behind its divider, the same scale
 
-After power-on or a reset the device sends its identity once and then waits for a start. It sends samples at least each
-0.005 s, since the wheels wait for them, and ignores frames that it does not know. The host takes every identity for a
-fresh start of the device: it sends a start, and the counts go on from where they were.
+After power-on or a reset the device sends its identity once and then waits for a start. It sends a samples frame at
+least every 0.005 s, because the wheel control needs them, and ignores frames that it does not know. The host treats
+every identity as a restart of the device: it sends a start, and its own unwrapped counts continue.
 """
 
 import binascii
@@ -48,27 +48,27 @@ FULL_SCALE = 65535.0
 
 READ_BYTES = 4096
 ASK_S = 0.25  # between two requests for the identity
-SEND_S = 0.02  # a frame has left
-ANSWER_S = 5.0  # a device that an opened port resets may start for some seconds
+SEND_S = 0.02  # time for the transmission of a frame
+ANSWER_S = 5.0  # opening the port may reset the device, whose start may take some seconds
 RETRY_S, LONGEST_RETRY_S = 0.1, 2.0  # between two attempts to open the port
-GARBAGE_BYTES = 64  # without a valid frame
+GARBAGE_BYTES = 64  # so many bytes without a valid frame are reported as a wrong baud rate
 BATTERY_S = 1.0  # time constant of the battery's voltage, over which the motors' currents average out
 
-# Of DeviceClock. SLEW: a clock may be wrong by 1 %, and what is left over has to be made up for.
+# Of DeviceClock. SLEW: twice the largest error of a clock, 1 %, so that a remaining offset decreases.
 SETTLE_S, WINDOW_S, SLEW, JUMP_S = 0.1, 0.2, 0.02, 0.1
 
 
 class SerialPort(Protocol):
-    """A serial port that never waits. OSError: it is gone."""
+    """A serial port that never waits. Its methods raise OSError if the device is gone."""
 
     def read(self, size: int, /) -> bytes:
-        """What has come, at most ``size`` bytes."""
+        """The received bytes, at most ``size``."""
 
     def write(self, data: bytes, /) -> object:
         """Send."""
 
     def reset_output_buffer(self) -> None:
-        """Forget what is not sent yet."""
+        """Discard the unsent bytes."""
 
     def close(self) -> None:
         """Release it."""
@@ -95,11 +95,11 @@ def format_frame(kind: int, seq: int, payload: bytes = b"", version: int = VERSI
 
 
 class Decoder:
-    """Frames out of bytes in any pieces; it keeps less than one frame.
+    """Finds the frames in bytes that arrive in pieces of any size; it stores less than one frame.
 
     Attributes:
         counts: ``frames``, ``lost`` (by gaps of the sequence numbers), ``crc_errors``, ``noise`` (bytes), ``unknown``.
-        other_version: of the protocol, that the newest valid frame has; 0: it has ours.
+        other_version: protocol version of the newest valid frame if it is not ``VERSION``, otherwise 0.
     """
 
     def __init__(self) -> None:
@@ -145,11 +145,11 @@ class Decoder:
 
 
 class DeviceClock:
-    """Times of the device on the robot's clock: the lower envelope of the arrival times.
+    """Converts times of the device to the robot's clock, by the lower envelope of the arrival times.
 
-    Arrival minus time of the device is the difference of the clocks plus a delay of transport that is never negative,
-    so its least value of ``WINDOW_S`` is followed, at most ``SLEW`` times as fast as time passes: intervals between
-    samples, and speeds with them, are right within 2 %. Times do not decrease and are not later than the arrival.
+    Arrival time minus device time is the offset of the clocks plus the transport delay, which is never negative. So the
+    offset follows the least difference within ``WINDOW_S``, at a rate of at most ``SLEW``: intervals between samples,
+    and therefore speeds, are right within 2 %. Times do not decrease and are not later than the arrival.
     """
 
     def __init__(self) -> None:
@@ -162,7 +162,7 @@ class DeviceClock:
         self._window_end_s = SETTLE_S
 
     def unwrap(self, device_us: int) -> float | None:
-        """Time of the device since its first sample, s; None: it went backwards."""
+        """Device time since its first sample, s; None if it went backwards."""
         step_us = 0 if self._last_us is None else (device_us - self._last_us) & 0xFFFFFFFF
         if step_us >= 0x80000000:
             return None
@@ -171,7 +171,7 @@ class DeviceClock:
         return self._device_s
 
     def arrive(self, now_s: float) -> bool:
-        """The newest unwrapped sample arrived at ``now_s``; False: too few have, or the times do not fit any more."""
+        """Take the arrival time of the newest sample; False while there are too few, or after a jump of the times."""
         difference_s = now_s - self._device_s
         self._least_s = min(self._least_s, difference_s)
         if self._device_s < SETTLE_S:
@@ -190,17 +190,17 @@ class DeviceClock:
         return True
 
     def time_s(self, device_s: float, now_s: float) -> float:
-        """Time on the robot's clock of an unwrapped time of the device."""
+        """Convert an unwrapped device time to the robot's clock."""
         return min(now_s, device_s + self._offset_s)
 
 
 class Daq:
-    """The device. ``poll`` never waits; it opens the port again after an unplug, and starts the device again.
+    """The device. ``poll`` never waits; after a disconnection it opens the port and starts the device again.
 
     Attributes:
         identity: name, version and serial number; empty until the device has answered.
         battery_v: voltage of the battery, smoothed; None before the first sample.
-        decoder: of the bytes that come.
+        decoder: of the received bytes.
     """
 
     def __init__(self, config: DaqConfig, open_port: OpenPort, clock: Clock, sleep: Sleep) -> None:
@@ -221,7 +221,7 @@ class Daq:
         self.decoder = Decoder()
 
     def open(self) -> None:
-        """Open the port and wait until samples come. Raises HardwareError."""
+        """Open the port and wait for samples. Raises HardwareError."""
         until_s = self._now() + ANSWER_S
         while not self.poll(self._now()):
             if self._port is None or self._now() > until_s:
@@ -231,7 +231,7 @@ class Daq:
             self._sleep(0.005)
 
     def poll(self, now_s: float) -> list[DaqSample]:
-        """Samples that came since the last call."""
+        """Samples since the last call."""
         samples: list[DaqSample] = []
         try:
             if self._port is None:
@@ -258,12 +258,12 @@ class Daq:
         return samples
 
     def fault(self, now_s: float) -> str:
-        """Why there is no sample for too long; empty: there is one."""
+        """The reason if the newest sample is older than ``timeout_s``, otherwise empty."""
         age_s = now_s - self._sample_s
         return "" if age_s <= self._config.timeout_s else f"no sample for {age_s:.2f} s: {self._why()}"
 
     def soc(self) -> float:
-        """State of charge, 0 to 1, linear in the voltage of the battery."""
+        """State of charge, 0 to 1, linear in the voltage of the battery; 1 before the first sample."""
         empty_v, full_v = self._config.battery_empty_v, self._config.battery_full_v
         battery_v = full_v if self.battery_v is None else self.battery_v
         return min(1.0, max(0.0, (battery_v - empty_v) / (full_v - empty_v)))
@@ -279,14 +279,14 @@ class Daq:
     def _release(self) -> None:
         port, self._port = self._port, None
         if port is not None:
-            # Closing would wait 30 s for a device that takes nothing; termios.error of one that is gone is no OSError.
+            # Closing would wait 30 s for unsent bytes. A device that is gone gives termios.error, which is no OSError.
             with suppress(Exception):
                 port.reset_output_buffer()
             with suppress(OSError):
                 port.close()
 
     def _supervise(self, now_s: float) -> None:
-        """Ask a device that sends no samples what it is; give up a port at which nothing valid comes."""
+        """Ask a device without samples for its identity. Raises OSError if no valid frame came for ``ANSWER_S``."""
         if now_s - self._valid_s > ANSWER_S:
             raise OSError(self._why())
         is_silent = not self._is_started or now_s - self._sample_s > ASK_S
@@ -295,7 +295,7 @@ class Daq:
             self._ask_s = now_s + ASK_S
 
     def _begin(self, payload: bytes) -> None:
-        """The device has started: its counts and its clock begin again."""
+        """Handle an identity: start the device; its counts and its clock begin again."""
         fastest_hz = int.from_bytes(payload[:2], "little")
         self.identity = " ".join(payload[2:].decode("utf-8", "replace").split("\0")).strip()
         if fastest_hz < self._config.sample_hz:
@@ -307,7 +307,7 @@ class Daq:
         timed = []
         for device_us, right, left, *edges, battery in SAMPLE.iter_unpack(payload):
             device_s = self._clock.unwrap(device_us)
-            if device_s is None:  # it was reset, and its identity got lost
+            if device_s is None:  # it was reset, and its identity was lost
                 self._is_started = False
                 return []
             before = self._last_counts or (right, left)
@@ -333,7 +333,7 @@ class Daq:
         return samples
 
     def _why(self) -> str:
-        """Why no sample comes."""
+        """The reason why there are no samples."""
         if self._port is None:
             return self._reason
         if version := self.decoder.other_version:

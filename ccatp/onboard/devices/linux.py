@@ -38,7 +38,7 @@ _Sampled = tuple[Sequence[Sequence[float]], float, dict[str, tuple[float, tuple[
 
 
 def import_package(name: str) -> Any:
-    """A package of the extra ``ccatp[onboard]``. Raises HardwareError: it is not installed."""
+    """A package of the extra ``ccatp[onboard]``. Raises HardwareError if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -55,7 +55,7 @@ class I2cBus:
             self._bus = self._smbus2.SMBus(number)
         except OSError as error:
             raise explain(error, f"/dev/i2c-{number}", "i2c", "devices.bno055.bus") from None
-        with suppress(OSError):  # not every controller has it
+        with suppress(OSError):  # not every controller has a time-out
             fcntl.ioctl(self._bus.fd, I2C_TIMEOUT, BUS_TIMEOUT_10MS)
 
     def write(self, address: int, data: bytes) -> None:
@@ -71,7 +71,7 @@ class I2cBus:
 
 
 def open_serial(device: str, baud: int) -> SerialPort:
-    """A serial port that is ours alone and never waits. Raises HardwareError."""
+    """Open a serial port for exclusive use, with reads that do not wait. Raises HardwareError."""
     serial = import_package("serial")
     try:
         port: SerialPort = serial.Serial(device, baud, timeout=0, write_timeout=0.002, exclusive=True)
@@ -108,7 +108,7 @@ class GpioLines:
 
 
 class LinuxHardware:
-    """The devices of the configuration; a ``Hardware``. ``clock`` is the robot's, the same as ``now_s`` of ``read``."""
+    """The devices of the configuration; a ``Hardware``. ``clock`` is the robot's clock, as ``now_s`` of ``read``."""
 
     def __init__(
         self,
@@ -128,8 +128,8 @@ class LinuxHardware:
         self._fans = FanOutputs(config.fans, pwm_root, sleep)
         self._imu = imu(config.bno055, partial(open_bus, config.bno055.bus), clock, sleep)
         self._daq = Daq(config.daq, open_port, clock, sleep)
-        # By their sections of the configuration, in the order of opening: the motors brake first, and the samples that
-        # nobody takes meanwhile come last.
+        # Keys: sections of the configuration. Order of opening: the motors brake first; the devices that then send
+        # samples, which are not read before all are open, come last.
         self._devices: dict[str, Motors | ExternalTimer | FanOutputs | Bno055 | Daq] = {
             "motors": self._motors,
             "timer": self._timer,
@@ -177,7 +177,7 @@ class LinuxHardware:
         self._timer.restart()
 
     def brake(self) -> None:
-        self._motors.brake()  # the external timer is not restarted: it brakes where this call could not
+        self._motors.brake()  # the external timer is not restarted: it brakes if this call fails
 
     def fans(self) -> tuple[float, float]:
         return self._fans.duties()
@@ -189,7 +189,7 @@ class LinuxHardware:
         self._opened.close()
 
     def check(self, duration_s: float) -> list[DeviceCheck]:
-        """Open each device, read for ``duration_s`` while the robot stands still, close; nothing turns."""
+        """Open each device, read for ``duration_s`` while the robot stands still, close; the motors brake."""
         failures: dict[str, str] = {}
         readings: list[Readings] = []
         with self._opened:

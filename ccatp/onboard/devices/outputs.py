@@ -1,4 +1,4 @@
-"""Outputs of the robot's computer: PWM of the kernel, GPIO lines; motors, fans and external timer made of them."""
+"""Outputs of the robot's computer: PWM of the kernel, GPIO lines; motors, fans and external timer that use them."""
 
 import errno
 import os
@@ -12,7 +12,7 @@ from ccatp.onboard.hardware import HardwareError
 
 PWM_ROOT = Path("/sys/class/pwm")
 _PWM_FILES = ("period", "duty_cycle", "enable")
-# udev gives the group its access to a channel a moment after the export.
+# udev gives the group access to a channel only some time after the export.
 _EXPORT_TRIES, _EXPORT_WAIT_S = 20, 0.05
 _DUTY_TOLERANCE = 0.01  # steps of the hardware
 
@@ -20,7 +20,7 @@ Sleep = Callable[[float], object]
 
 
 def explain(error: OSError | ValueError, device: str, group: str, key: str) -> HardwareError:
-    """One line about a device file that cannot be opened or written; ``key`` is the part of the configuration."""
+    """The error of a device file that cannot be opened or written; ``key`` is the part of the configuration."""
     denied = f"permission denied; add the user of this program to the group {group}"
     in_use = f"in use by another program or driver; stop it, or check {key}"
     advice = {
@@ -45,7 +45,7 @@ class OutputLines(Protocol):
         """Release them."""
 
 
-# Chip and the first values of its lines, which are in force from the moment in which a line becomes an output.
+# Chip and the first values of its lines, which apply from the moment in which a line becomes an output.
 OpenLines = Callable[[str, Mapping[int, bool]], OutputLines]
 
 
@@ -65,7 +65,7 @@ class Pwm:
         self._fds: dict[str, int] = {}
 
     def open(self) -> None:
-        """Export the channel and open its files; changes nothing of what it puts out."""
+        """Export the channel and open its files; the output does not change."""
         try:
             if not self._folder.is_dir():
                 fd = os.open(self._folder.parent / "export", os.O_WRONLY)
@@ -101,11 +101,11 @@ class Pwm:
         self._write("enable", 1)
 
     def is_enabled(self) -> bool:
-        """Whether it puts out anything."""
+        """Whether the output is on."""
         return self._read("enable") != 0
 
     def duty(self) -> float:
-        """Duty in force, 0 to 1, as the kernel has it."""
+        """Duty, 0 to 1, as read back from the kernel; 0 while the channel is off."""
         self.period_ns = self._read("period")
         return self._read("duty_cycle") / self.period_ns if self.period_ns and self.is_enabled() else 0.0
 
@@ -114,7 +114,7 @@ class Pwm:
         self._write("duty_cycle", round(min(1.0, max(0.0, duty)) * self.period_ns))
 
     def restore(self, duty: float) -> None:
-        """Set and enable what is not ``duty``, and read it back."""
+        """If the duty is not ``duty``, set it and enable the channel; then read it back."""
         if abs(self.duty() - duty) > _DUTY_TOLERANCE:
             self.set_duty(duty)
             self._write("enable", 1)
@@ -122,7 +122,7 @@ class Pwm:
             raise HardwareError(f"{self._label}: duty {found:.2f} instead of {duty:.2f}; check its driver")
 
     def close(self) -> None:
-        """Close the files; what the channel puts out stays as it is."""
+        """Close the files; the output does not change."""
         while self._fds:
             os.close(self._fds.popitem()[1])
 
@@ -142,9 +142,9 @@ class Pwm:
 
 
 class Motors:
-    """Both motors behind their bridge: each two lines for the direction and a PWM; both lines high short-brake.
+    """Both motors with their bridge: each has two lines for the direction and a PWM; both lines high short-brake.
 
-    A motor goes from one direction to the other through the brake, and its duty is set while it brakes.
+    A motor brakes between one direction and the other; its duty for a new direction is set while it brakes.
     """
 
     def __init__(self, config: MotorsConfig, root: Path, open_lines: OpenLines, sleep: Sleep) -> None:
@@ -162,7 +162,7 @@ class Motors:
         return " ".join(pwm.identity for _, pwm in self._motors)
 
     def open(self) -> None:
-        """Brake, then make the PWM ready. Raises HardwareError."""
+        """Brake, then set up the PWM. Raises HardwareError."""
         both = {line: True for motor, _ in self._motors for line in (motor.forward_line, motor.reverse_line)}
         if len(both) < 4:
             raise HardwareError("motors: a GPIO line is named twice; correct the lines in devices.motors")
@@ -187,13 +187,13 @@ class Motors:
             raise
 
     def brake(self) -> None:
-        """Both lines of both motors high, then full duty, whatever was in force before. Raises HardwareError."""
+        """Set both lines of both motors high, then full duty, also if they brake already. Raises HardwareError."""
         self._direct([0, 0], is_forced=True)
         for _, pwm in self._motors:
             pwm.set_duty(1.0)
 
     def close(self) -> None:
-        """Brake and release. What a released line does depends on its chip: the external timer brakes on."""
+        """Brake and release. The state of a released line depends on its chip; then the external timer brakes."""
         with suppress(HardwareError):
             self.brake()
         for _, pwm in self._motors:
@@ -216,10 +216,10 @@ class Motors:
 
 
 class FanOutputs:
-    """Both fans. What is in force when the program starts stays in force, period included, and stays when it ends.
+    """Both fans. The program's start and end do not change the duty and period of a fan that runs.
 
     Attributes:
-        faults: fans that do not work, by their names on the robot link, with the reason.
+        faults: reason of each fan's fault, by the fan's name on the robot link.
     """
 
     def __init__(self, config: FansConfig, root: Path, sleep: Sleep) -> None:
@@ -237,7 +237,7 @@ class FanOutputs:
         return " ".join(f"{fan.identity} {fan.period_ns / 1e3:g} us" for fan in self._fans.values())
 
     def open(self) -> None:
-        """Open both; one that runs is not touched, one that is off is enabled at duty 0. Raises HardwareError."""
+        """Open both; a fan that runs is not changed, one that is off is enabled at duty 0. Raises HardwareError."""
         for fan in self._fans.values():
             fan.open()
             if not fan.is_enabled():
@@ -249,14 +249,14 @@ class FanOutputs:
         return left, right
 
     def command(self, left: float, right: float) -> None:
-        """Set the duties; a fan that refuses does not keep the other from its duty. Raises HardwareError."""
+        """Set the duties; if one fan fails, the other is set all the same. Raises HardwareError."""
         self._commanded = {"fan_left": min(1.0, max(0.0, left)), "fan_right": min(1.0, max(0.0, right))}
         self.check()
         if self.faults:
             raise HardwareError("; ".join(self.faults.values()))
 
     def check(self) -> None:
-        """Compare what the kernel has with what was commanded, set what differs, and update ``faults``."""
+        """Compare the kernel's duties with the commanded ones, set those that differ, and update ``faults``."""
         self.faults = {}
         for name, fan in self._fans.items():
             try:
@@ -265,13 +265,13 @@ class FanOutputs:
                 self.faults[name] = str(error)
 
     def close(self) -> None:
-        """Close the files; the duties stay in force."""
+        """Close the files; the duties do not change."""
         for fan in self._fans.values():
             fan.close()
 
 
 class ExternalTimer:
-    """The timer outside this computer that brakes the motors when its line has not changed for a while."""
+    """The timer outside this computer that brakes the motors when its line has not changed for its time-out."""
 
     def __init__(self, config: ExternalTimerConfig, open_lines: OpenLines) -> None:
         self._config, self._open_lines = config, open_lines
