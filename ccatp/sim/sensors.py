@@ -204,6 +204,17 @@ def draw_rectangles(
     return found
 
 
+def _outer_sides(panel: PanelId, material: Mapping[PanelId, Rectangle]) -> Rectangle:
+    """The sides of a panel that lie at the rim; infinitely far where it has a neighbour."""
+    (row, col), (x0, x1, y0, y1) = panel, material[panel]
+    return (
+        -inf if PanelId(row, col - 1) in material else x0,
+        inf if PanelId(row, col + 1) in material else x1,
+        -inf if PanelId(row - 1, col) in material else y0,
+        inf if PanelId(row + 1, col) in material else y1,
+    )
+
+
 class EdgeSensors:
     """Whether there is panel material under each edge sensor; ``place`` before the first ``read``.
 
@@ -215,6 +226,7 @@ class EdgeSensors:
         self, mirror: Mirror, offsets_m: Sequence[tuple[float, float]], material: Mapping[PanelId, Rectangle]
     ) -> None:
         self._panel_at, self._material = mirror.panel_at, material
+        self._outer = {panel: _outer_sides(panel, material) for panel in material}
         self._offsets = [(float(x), float(y)) for x, y in offsets_m]
         self._reach_m = _CURVED * max(hypot(x, y) for x, y in self._offsets)
         self._values = (1, 1, 1, 1)
@@ -252,9 +264,8 @@ class EdgeSensors:
         panel = self._panel_at(x, y)
         if panel is None:
             return inf
-        (row, col), (x0, x1, y0, y1) = panel, self._material[panel]
-        sides = ((row, col - 1), x - x0), ((row, col + 1), x1 - x), ((row - 1, col), y - y0), ((row + 1, col), y1 - y)
-        return min((distance_m for beside, distance_m in sides if PanelId(*beside) not in self._material), default=inf)
+        x0, x1, y0, y1 = self._outer[panel]
+        return min(x - x0, x1 - x, y - y0, y1 - y)
 
     def _look(self) -> None:
         inside_m = [self._inside_m(x, y) for x, y in self.places]
