@@ -1,6 +1,6 @@
 """Monte Carlo campaigns, comparisons with published results and with peers, replay of recorded runs.
 
-This file holds the table of studies. It imports nothing heavy, since the help of the command reads it.
+This file contains the table of studies. It imports no large package, because the command's help reads it.
 """
 
 import difflib
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
 """A study without runs: a configuration and a directory, to what ``result.json`` holds."""
 
-# Name: module and name in it of a Study or an Analysis, title.
+# Name: module and the name in it of a Study or an Analysis; title.
 STUDIES = {
     "thesis": ("thesis_study:STUDY", "the thesis's own simulation again, under several readings"),
     "filters": ("survey_studies:FILTERS", "filters in four worlds, over whole missions"),
@@ -45,7 +45,7 @@ STUDIES = {
 
 
 def find_study(name: str) -> "Study | Analysis":
-    """The study of a name (raises CampaignError: there is none)."""
+    """The study of a name. Raises CampaignError: there is none."""
     from ccatp.studies.campaign import CampaignError, Study  # noqa: PLC0415
 
     if name not in STUDIES:
@@ -59,9 +59,9 @@ def find_study(name: str) -> "Study | Analysis":
 
 
 def limit_threads() -> None:
-    """Ask for one thread of the linear algebra, here and in children; acts only before numpy is imported.
+    """Limit linear algebra to one thread, here and in child processes; has an effect only before numpy is imported.
 
-    On matrices this small more threads cost time, and compete with the workers.
+    For such small matrices more threads are slower, and compete with the workers.
     """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

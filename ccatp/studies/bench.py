@@ -1,4 +1,4 @@
-"""Benchmarks: every case of one table against its peers by turns on one clock, missions, and the result as text."""
+"""Benchmarks: each case of a table timed alternately with its peers, timed missions, and the result as text."""
 
 import gc
 import os
@@ -28,18 +28,19 @@ CPU_INFO = Path("/proc/cpuinfo")
 def run_bench(
     cfg: Config, *, quick: bool, run_args: Sequence[str] = (), frames: bool = True, steps: bool = True
 ) -> dict[str, Any]:
-    """Run every benchmark, ``quick`` with a tenth of the repeats and missions of one panel.
+    """Run all benchmarks; ``quick``: with a tenth of the rounds, and missions of one panel.
 
-    ``run_args``: what else ``ccatp run`` needs for this configuration. BenchError: results differ, a mission failed.
+    ``run_args``: further arguments of ``ccatp run`` for this configuration. Raises BenchError: results differ, or a
+    mission failed.
     """
-    # Missions first: they start in a process that has allocated little.
+    # Missions first, while this process has allocated little memory.
     of_frames = frame_cases(cfg, run_args, quick=quick) if frames else []
     of_steps = step_cases(cfg, QUICK_ROUNDS if quick else ROUNDS) if steps else ()
     return {"machine": machine(), "equal_within": EQUAL_WITHIN, "cases": [*of_steps, *of_frames]}
 
 
 def step_cases(cfg: Config, rounds: int) -> Iterator[dict[str, Any]]:
-    """Every race, against each of its peers."""
+    """Results of every race against each of its peers."""
     for name, ours, peers, is_dense, note in races(cfg):
         most = min(rounds, MOST_DENSE_ROUNDS) if is_dense else rounds
         for peer_name, peer in peers.items():
@@ -53,7 +54,7 @@ def step_cases(cfg: Config, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def step_case(name: str, ours: Contender, peer_name: str, peer: Contender | None, rounds: int) -> dict[str, Any]:
-    """The figures of one race (raises BenchError: the results differ, so that times cannot be compared)."""
+    """Result of one race. Raises BenchError: the results differ, so the times cannot be compared."""
     found: dict[str, Any] = {"name": name}
     if peer is not None:
         difference = largest_difference(ours, peer)
@@ -73,10 +74,11 @@ def step_case(name: str, ours: Contender, peer_name: str, peer: Contender | None
 
 
 def race(ours: Contender, peer: Contender | None, rounds: int) -> FloatArray:
-    """Time every step of both, a round of steps each by turns, who begins by turns as well.
+    """Time every step of both contenders, in alternate rounds; they also alternate in who begins a round.
 
-    So a machine that slows down slows both, and neither runs on caches that the other one has filled. One round more
-    warms up. Returns wall times of single steps of ours and of the peer, if any, us, shape (1 or 2, rounds, STEPS).
+    So a machine that slows down slows both, and neither always runs on caches that the other one has filled. One
+    additional round warms up. Returns elapsed times of single steps of ours and of the peer, if any, us, shape
+    (1 or 2, rounds, STEPS).
     """
     both = [ours] if peer is None else [ours, peer]
     taken = np.zeros((len(both), rounds, STEPS))
@@ -101,7 +103,7 @@ def race(ours: Contender, peer: Contender | None, rounds: int) -> FloatArray:
 
 
 def largest_difference(ours: Contender, peer: Contender) -> float:
-    """Largest difference between any entries of the results of two contenders, after any of the steps; SI units."""
+    """Largest difference of any entry of the two results after any step, SI units; NaN if the peer's is not finite."""
     solutions = ours(), peer()
     readers = [next(solution) for solution in solutions]
     largest = 0.0
@@ -116,9 +118,9 @@ def largest_difference(ours: Contender, peer: Contender) -> float:
 
 
 def machine() -> dict[str, object]:
-    """Processor, usable cores, Python, build and versions of what takes part, threads of the linear algebra."""
+    """Processor, usable cores, versions of Python and the packages, threads of the linear algebra."""
     cpu, cores = platform.processor() or platform.machine(), os.cpu_count() or 1
-    with suppress(OSError):  # the model as the kernel names it
+    with suppress(OSError):  # the kernel's name of the model
         lines = [line.partition(":") for line in CPU_INFO.read_text(encoding="utf-8").splitlines()]
         cpu = next((model.strip() for name, _, model in lines if name.strip() == "model name"), cpu)
     with suppress(AttributeError):  # not on every system
@@ -135,14 +137,14 @@ BY_HAND = "<!-- by hand -->\n"
 
 
 def write_page(path: Path, result: Mapping[str, Any]) -> None:
-    """Write the page; what follows ``BY_HAND`` in an existing one stays."""
+    """Write the page; text after ``BY_HAND`` in an existing page is kept."""
     before = path.read_text(encoding="utf-8") if path.exists() else ""
     _, mark, by_hand = before.partition(BY_HAND)
     path.write_text(tables(result, is_page=True) + (f"\n{mark}{by_hand}" if mark else ""), encoding="utf-8")
 
 
 def tables(result: Mapping[str, Any], *, is_page: bool = False) -> str:
-    """The machine, the cases as Markdown tables, and each remark once: on the terminal and in ``docs/bench.md``."""
+    """Machine, Markdown tables of the cases, and each note once: for the terminal and for ``docs/bench.md``."""
     cases = result["cases"]
     frames, steps = ([case for case in cases if ("us_spread" in case) is is_frame] for is_frame in (True, False))
     notes = dict.fromkeys(case["note"] for case in cases if "note" in case)

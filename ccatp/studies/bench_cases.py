@@ -1,7 +1,7 @@
-"""What is raced: problems drawn from a seed, this project's parts and their peers as contenders that solve them.
+"""The cases of the benchmarks: problems drawn from a seed, and this project's and the peers' solutions (contenders).
 
-filterpy and Stone Soup belong to the extra ``peers`` and are imported when a race is set up; models are built before
-the clock starts. What the peers compute has to be what this project computes: the race checks it.
+filterpy and Stone Soup belong to the extra ``peers`` and are imported when a race is set up. Models are built before
+the clock starts. The race checks that the peers compute the same as this project.
 """
 
 from collections.abc import Callable, Iterator
@@ -27,7 +27,7 @@ STEPS, DT_S, SEED = 50, 0.01, 1
 MILDER = 1e4
 """Factor on the noise of the four states' readings. As it is shipped, an encoder's sigma of 0.001 rad/s against what a
 frame leaves unknown costs forms with an inverse and (I - W H) P half their digits: nothing could be compared."""
-_SURVEY_START = (0.3, -0.4, 0.5, 0.05, 0.1)  # on the mirror, under way and turning: X, Y, PSI, V, W
+_SURVEY_START = (0.3, -0.4, 0.5, 0.05, 0.1)  # on the mirror, driving and turning: X, Y, PSI, V, W
 _ANGLE_RAD2, _POSITION_M2, _HEADING_RAD2 = 1e-6, 1e-8, 1e-4  # variances of a wheel's angle, a fix, a heading
 
 Solution = Iterator[Any]
@@ -40,7 +40,7 @@ Contender = Callable[[], Solution]
 
 
 class Race(NamedTuple):
-    """A case: ours against each peer; without peers, why. ``dense``: a peer that takes long, raced for few rounds."""
+    """A case: ours against each peer; ``note``: why there is no peer; ``is_dense``: the peer is slow: fewer rounds."""
 
     name: str
     ours: Contender
@@ -51,7 +51,7 @@ class Race(NamedTuple):
 
 def races(cfg: Config) -> Iterator[Race]:
     """Steps of filters, of range SLAM (a prediction and a scalar update) and of multilateration."""
-    # kf: inertial unit; and one sample of each wheel; and ten. ekf: models as matrices.
+    # kf: the inertial unit, with none, one and ten samples of each wheel. ekf: the models as matrices.
     linear = [("kf", thesis_problem(cfg, m)) for m in (2, 4, 22)]
     linear += [("ekf", linearised_problem(cfg, m)) for m in (4, 6, 23)]
     for filter_name, problem in (*linear, ("ukf", survey_problem(cfg))):
@@ -78,7 +78,7 @@ def races(cfg: Config) -> Iterator[Race]:
 
 
 class FilterProblem(NamedTuple):
-    """Predict, and update with each reading, from a prior."""
+    """A prior, models and readings: one prediction and one update per reading."""
 
     mean: FloatArray  # shape (n,)
     covariance: FloatArray  # shape (n, n)
@@ -90,7 +90,7 @@ class FilterProblem(NamedTuple):
 
 
 def thesis_problem(cfg: Config, rows: int) -> FilterProblem:
-    """Thesis eqs 2.11 and 2.12: n = 4, ``rows`` = 2 k + 2 with k samples of each wheel."""
+    """Thesis eqs 2.11 and 2.12: n = 4; ``rows`` = 2 k + 2 for k samples of each wheel."""
     robot, noise, k = cfg.robot, cfg.localizer, (rows - 2) // 2
     H = np.zeros((rows, 4))
     H[: 2 * k, 0] = 1.0 / robot.wheel_radius_m
@@ -118,7 +118,7 @@ def linear_problem(
 
 
 def survey_problem(cfg: Config) -> FilterProblem:
-    """The full-state localizer's problem with its own models: n = 20, both wheels' angles, rate and acceleration."""
+    """The full-state localizer's problem with its models: n = 20; readings: both wheel angles, rate, acceleration."""
     rng = np.random.default_rng((SEED, sm.STATES))
     robot, full = cfg.robot, cfg.localizer.full_state
     mean, sigma = np.zeros(sm.STATES), np.zeros(sm.STATES)
@@ -151,9 +151,9 @@ def survey_problem(cfg: Config) -> FilterProblem:
 
 
 def linearised_problem(cfg: Config, rows: int) -> FilterProblem:
-    """The same with its Jacobians at the start as matrices, so that the filter is timed and not the models.
+    """``survey_problem`` with its initial Jacobians as matrices, so that the filter is timed without the models.
 
-    Rows are the four sensors; with a fix of both coordinates (6); with ten samples of each and a heading (23).
+    Rows: the four sensors (4); with a fix of both coordinates (6); with ten samples of each wheel and a heading (23).
     """
     problem = survey_problem(cfg)
     F, sensors = problem.F.at(problem.mean)[1].copy(), problem.H.at(problem.mean)[1].copy()
@@ -181,7 +181,7 @@ def our_filter(name: str, problem: FilterProblem) -> Solution:
 
 
 def printed_filter(problem: FilterProblem) -> Solution:
-    """Thesis eq. 2.13 with its inverse and its (I - W H) P in bare numpy, without a check."""
+    """Thesis eq. 2.13 as printed, with an inverse and (I - W H) P, in numpy without checks."""
     x, P, F, H, Q, variances, readings = problem
     R, identity = np.diag(variances), np.eye(x.size)
     yield tuple
@@ -195,12 +195,12 @@ def printed_filter(problem: FilterProblem) -> Solution:
 
 
 def _sigma_points(problem: FilterProblem) -> dict[str, float]:
-    """The parameters of our sigma points, by the names that both peers give them."""
+    """Parameters of our sigma points, by the names that both peers use."""
     return {"alpha": ALPHA, "beta": BETA, "kappa": max(KURTOSIS - problem.mean.size, 0.0)}
 
 
 def filterpy(problem: FilterProblem) -> Solution:
-    """Filterpy's Kalman filter for matrices; its unscented one with the scaled points of Merwe for models."""
+    """Filterpy's Kalman filter for matrices, its unscented filter with Merwe's scaled points for models."""
     from filterpy.kalman import KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter  # noqa: PLC0415 - an extra
 
     mean, covariance, F, H, Q, variances, readings = problem
@@ -245,7 +245,7 @@ def stonesoup(problem: FilterProblem) -> Solution:
 
 
 def _stonesoup_models(problem: FilterProblem, *, is_linear: bool) -> tuple[Any, Any]:
-    """The motion and the measurement."""
+    """Motion and measurement model for Stone Soup."""
     from stonesoup.models.base import TimeInvariantModel  # noqa: PLC0415 - belongs to an extra
     from stonesoup.models.measurement.linear import LinearGaussian  # noqa: PLC0415
     from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement  # noqa: PLC0415
@@ -286,7 +286,7 @@ def _stonesoup_models(problem: FilterProblem, *, is_linear: bool) -> tuple[Any, 
     return motion, Rows(**about)
 
 
-# -- range SLAM: a vehicle on an arc receives one beacon a step -------------------------------------------------------
+# -- range SLAM: a vehicle on an arc receives one beacon per step -----------------------------------------------------
 
 _VEHICLE, _SHARED, _BLOCK = 3, 2, 2  # pose; scale and offset of ranges; place of a beacon
 _RANGE_SIGMA_M, _STEP_M, _TURN_RAD = 0.1, 0.05, 0.02
@@ -294,16 +294,16 @@ _SLAM_NOISE = np.diag((1e-4, 1e-4, 1e-5))
 
 
 class SlamProblem(NamedTuple):
-    """Pose, range scale and offset, and beacons: mean (n,), covariance (n, n); a range a step, of each in turn."""
+    """Pose, range scale and offset, beacons: mean (n,), covariance (n, n); one range per step, to each in turn."""
 
     mean: FloatArray
     covariance: FloatArray
     ranges_m: FloatArray
-    touched: list[list[int]]  # states that a range to each beacon depends on
+    touched: list[list[int]]  # states on which a range to each beacon depends
 
 
 def slam_problem(beacons: int) -> SlamProblem:
-    """Beacons about the vehicle at 3 to 8 m, known to 0.3 m."""
+    """Beacons at 3 to 8 m about the vehicle, with a standard deviation of 0.3 m per coordinate."""
     rng = np.random.default_rng((SEED, beacons))
     angles, radii = tau * np.arange(beacons) / beacons, rng.uniform(3.0, 8.0, beacons)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
@@ -319,7 +319,7 @@ def slam_problem(beacons: int) -> SlamProblem:
 
 
 def our_slam(problem: SlamProblem) -> Solution:
-    """Blocks and sparse rows."""
+    """``EkfSlam``, with blocks and sparse rows."""
     x, P, ranges_m, touched = problem
     shared = slice(_VEHICLE, _VEHICLE + _SHARED)
     ours = EkfSlam(x[:_VEHICLE], P[:_VEHICLE, :_VEHICLE], x[shared], P[shared, shared])
@@ -338,7 +338,7 @@ def our_slam(problem: SlamProblem) -> Solution:
 
 
 def dense_slam(problem: SlamProblem) -> Solution:
-    """The same by F P F^T + Q and (I - K H) P of the whole state, in bare numpy."""
+    """The same by F P F^T + Q and (I - K H) P of the whole state, in numpy."""
     x, P, ranges_m, touched = problem
     x, n = x.copy(), x.size
     identity, Q = np.eye(n), np.zeros((n, n))
@@ -357,7 +357,7 @@ def dense_slam(problem: SlamProblem) -> Solution:
 
 
 def _moved(pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The pose a step on, and its Jacobian."""
+    """The pose after a step, and its Jacobian."""
     x, y, heading = pose.tolist()
     dx, dy = _STEP_M * cos(heading), _STEP_M * sin(heading)
     F = np.array(((1.0, 0.0, -dy), (0.0, 1.0, dx), (0.0, 0.0, 1.0)))
@@ -373,11 +373,11 @@ def _range(states: list[float]) -> tuple[float, list[float]]:
     return (1.0 + scale) * r + offset, [-ux, -uy, 0.0, r, 1.0, ux, uy]
 
 
-# -- a puck's position out of its lengths -----------------------------------------------------------------------------
+# -- a puck's position from its lengths -------------------------------------------------------------------------------
 
 
 class RangeProblem(NamedTuple):
-    """Anchors (m, 3); lengths and their sigmas (k, m) of k pucks; where each is looked for (k, 3); all m."""
+    """Anchors (m, 3); lengths of k pucks and their sigmas (k, m); expected positions (k, 3); all in metres."""
 
     anchors_m: FloatArray
     ranges_m: FloatArray
@@ -386,7 +386,7 @@ class RangeProblem(NamedTuple):
 
 
 def range_problem(cfg: Config) -> RangeProblem:
-    """Pucks at the first stops of the mirror, looked for some millimetres off."""
+    """Pucks at the first stops of the mirror, with expected positions that are some millimetres off."""
     rng = np.random.default_rng((SEED, 3))
     mirror = build_mirror(cfg.mirror)
     anchors = 1e-3 * np.array(cfg.mirror.collimators.positions_world_mm)
@@ -408,9 +408,9 @@ def our_position(problem: RangeProblem) -> Solution:
 
 
 def scipy_position(problem: RangeProblem) -> Solution:
-    """The same weighted least squares by SciPy's Levenberg-Marquardt, and the covariance out of its Jacobian."""
+    """The same weighted least squares by SciPy's Levenberg-Marquardt, and the covariance from its Jacobian."""
     anchors_m, *pucks = problem
-    tolerance = sqrt(np.finfo(np.float64).eps)  # quadratic convergence squares it
+    tolerance = sqrt(np.finfo(np.float64).eps)  # sufficient: with quadratic convergence the next error is its square
 
     def residuals(x: FloatArray, ranges: FloatArray, sigmas: FloatArray) -> FloatArray:
         offsets = x - anchors_m

@@ -2,8 +2,8 @@
 
     python -m ccatp.studies.calibrator [--json]
 
-A figure of a benchmark divided by the calibrator's, taken beside it under the same load, compares machines: both
-processes only read, write and wake each other, with the standard library's json.
+The time of a benchmark divided by that of the calibrator, measured under the same load, can be compared between
+machines: both processes only read, write and wake each other, with the json module of the standard library.
 """
 
 import argparse
@@ -23,8 +23,8 @@ FRAMES, ROUNDS, WARM_UP_FRAMES = 4000, 5, 200
 TIMEOUT_S = 120.0
 IDLE, ONE_CORE, BUSY = "idle", "all on one core", "one busy process per core"
 LOADS = (IDLE, ONE_CORE, BUSY)
-SPAWN = multiprocessing.get_context("spawn")  # plain: nothing of this process is in them
-# A frame of a robot that drives: ten samples of wheels and edge sensors, as in the configuration that is shipped.
+SPAWN = multiprocessing.get_context("spawn")  # new interpreters, without the modules of this process
+# A frame of a driving robot: ten samples of wheels and edge sensors, as in the shipped configuration.
 SENSORS: dict[str, Any] = {
     "type": "sensors", "seq": 300, "t": 3.0,
     "imu": [[3.0, 0.0005933, -0.0152406]],
@@ -37,7 +37,7 @@ DRIVE: dict[str, Any] = {"type": "drive", "seq": 300, "ack": 300, "wr": 1.000273
 
 
 def calibrate(frames: int = FRAMES) -> tuple[float, float]:
-    """Wall time of a frame there and back, and CPU time of both processes for it, us, in the present load."""
+    """Elapsed time of a frame and its answer, and CPU time of both processes for it, us, under the present load."""
     found = SPAWN.Queue()
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
@@ -49,7 +49,7 @@ def calibrate(frames: int = FRAMES) -> tuple[float, float]:
 
 @contextmanager
 def load(name: str) -> Iterator[None]:
-    """One of ``LOADS`` for the processes that are started meanwhile."""
+    """Apply one of ``LOADS`` to the processes that are started in this context."""
     if not hasattr(os, "sched_setaffinity"):  # not on every system
         yield
         return
@@ -68,7 +68,7 @@ def load(name: str) -> Iterator[None]:
 
 @contextmanager
 def _started(*calls: tuple[Any, tuple[Any, ...]]) -> Iterator[list[Any]]:
-    """A process for each call of a function; they are ended afterwards."""
+    """Start a process for each call of a function; kill them at the end of the context."""
     processes = [SPAWN.Process(target=function, args=arguments, daemon=True) for function, arguments in calls]
     try:
         for process in processes:
@@ -85,7 +85,7 @@ def _exchange(found: Any, frames: int, end: socket.socket | int) -> None:
 
 
 async def _drive_robot(listener: socket.socket, frames: int) -> tuple[float, float]:
-    """Serve one client: send a frame, await its drive."""
+    """Serve one client: send each frame and await its drive."""
     done: asyncio.Future[tuple[float, float]] = asyncio.get_running_loop().create_future()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -104,7 +104,7 @@ async def _drive_robot(listener: socket.socket, frames: int) -> tuple[float, flo
 
 
 async def _control(port: int) -> tuple[float, float]:
-    """Answer each frame by a drive, until the robot closes."""
+    """Answer each frame with a drive, until the robot closes the connection."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)  # asyncio sets TCP_NODELAY
     wall_s = cpu_s = 0.0
     while line := await reader.readline():
@@ -117,7 +117,7 @@ async def _control(port: int) -> tuple[float, float]:
 
 
 def _be_busy(core: int, busy: Any) -> None:
-    """Load a core as long as whoever started this lives."""
+    """Load a core until the parent process ends."""
     os.sched_setaffinity(0, {core})
     parent = os.getppid()
     busy.release()
@@ -127,7 +127,10 @@ def _be_busy(core: int, busy: Any) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print wall and CPU time of a frame in each load; the loads by turns: a machine that slows down slows all."""
+    """Print elapsed and CPU time of a frame under each load.
+
+    The loads alternate, so a machine that slows down slows all of them.
+    """
     parser = argparse.ArgumentParser(prog="python -m ccatp.studies.calibrator", description="A frame of two processes.")
     parser.add_argument("--frames", type=int, default=FRAMES, help="Frames of a round.")
     parser.add_argument("--rounds", type=int, default=ROUNDS)

@@ -1,4 +1,4 @@
-"""What a campaign is: cells of factors, crossed with seeds into jobs that can run anywhere in any order."""
+"""Types of a campaign: cells of factors, crossed with seeds to jobs that can run anywhere in any order."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,35 +18,35 @@ Factor = str | int | float | bool
 Factors = Mapping[str, Factor]
 Arrays = Mapping[str, NDArray[Any]]
 AnyConfig = Config | RadioConfig | RecordingsConfig
-# Dotted keys, stronger than the configuration file, to a configuration.
+# From dotted keys, which override the configuration file, to a configuration.
 Load = Callable[[Mapping[str, object]], AnyConfig]
 
 
 class CampaignError(UsageError):
-    """A campaign that cannot be run as asked; what was done before is kept."""
+    """A campaign that cannot be run as requested; finished jobs are kept."""
 
 
 class CampaignFailed(CampaignError):
-    """Jobs failed, a worker died, or the results cannot be written; what was done is kept."""
+    """Jobs failed, a worker died, or the results cannot be written; finished jobs are kept."""
 
     exit_status = ExitStatus.HELD
 
 
 class CampaignInterrupted(CampaignError):
-    """The user stopped it; what was done is kept."""
+    """The user stopped the campaign; finished jobs are kept."""
 
     exit_status = ExitStatus.INTERRUPTED
 
 
 class ClusterUnreachable(CampaignError):
-    """No scheduler answers."""
+    """No scheduler of the cluster answers."""
 
     exit_status = ExitStatus.UNREACHABLE
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One combination of factors, as they stand in ``result.json``, and the dotted keys that make it."""
+    """One combination of factors, as in ``result.json``, and the dotted keys that select it."""
 
     factors: Factors
     overrides: Mapping[str, object] = field(default_factory=dict)
@@ -54,12 +54,12 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """All that a worker is given: the outcome is a function of these four and nothing else."""
+    """The input of a worker: the outcome depends on these four values only."""
 
     study: str
     factors: Factors
     seed: int
-    cfg: Any  # what the study's loader gives
+    cfg: Any  # configuration from the study's loader
 
     @property
     def key(self) -> str:
@@ -68,23 +68,23 @@ class Job:
 
     @property
     def fingerprint(self) -> str:
-        """Of everything that the outcome depends on, this program's version included."""
+        """Hash of everything on which the outcome depends, including this program's version."""
         whole = [ccatp.__version__, self.study, dict(self.factors), self.seed, self.cfg.model_dump(mode="json")]
         return sha256(dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
-NO_ARRAYS: Arrays = {}  # not to be written to; a read-only view could not cross to another process
+NO_ARRAYS: Arrays = {}  # must not be changed; a read-only view cannot be sent to another process
 
 
 class JobOutcome(NamedTuple):
-    """The outcome of a job, or of all jobs of a cell; numbers in ``values`` that are not finite become null."""
+    """The outcome of a job, or of all jobs of a cell; numbers in ``values`` that are not finite are written as null."""
 
     values: Mapping[str, Any]
     arrays: Arrays = NO_ARRAYS
 
 
 class CellResult(NamedTuple):
-    """One cell of the result: its factors, runs and figures, and its arrays."""
+    """One cell of the result: factors, values (with the number of runs) and arrays."""
 
     factors: Factors
     values: Mapping[str, Any]
@@ -93,22 +93,22 @@ class CellResult(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """A campaign that has a name; workers import ``run_job`` by its name, outcomes are combined in order of seeds."""
+    """A named campaign; workers import ``run_job`` by its name, and outcomes are combined in order of seeds."""
 
     cells: Callable[[], Sequence[Cell]]
     run_job: Callable[[Job], JobOutcome]
     combine: Callable[[Factors, Sequence[JobOutcome]], JobOutcome]
     columns: str  # of ``table.md``: see ``results.columns_of``
     draw: Callable[[Sequence[CellResult], Path], None]
-    # Dotted keys: stronger than the configuration file, weaker than the command line.
+    # Dotted keys: they override the configuration file, and the command line overrides them.
     defaults: Mapping[str, object] = field(default_factory=dict)
-    mirrors: tuple[str, ...] = ("thesis-m1",)  # crossed with the cells; empty where these choose the mirror
+    mirrors: tuple[str, ...] = ("thesis-m1",)  # crossed with the cells; empty if the cells choose the mirror
     runs: int = 20  # seeds of each cell, by default
-    loader: str = "load_config"  # of its configurations, in ``ccatp.config.load``
-    # What was published of a cell: ``printed`` in its result.
+    loader: str = "load_config"  # function of ``ccatp.config.load``
+    # Published values of a cell: ``printed`` in its result.
     published: Callable[[Factors], Mapping[str, Any]] | None = None
-    with_peers: Callable[[], Sequence[Cell]] | None = None  # its cells with those of other people's programs
-    name: str = ""  # both as in the table of studies, see ``find_study``
+    with_peers: Callable[[], Sequence[Cell]] | None = None  # its cells, with those of programs by other authors
+    name: str = ""  # name and title are those of the table of studies, see ``find_study``
     title: str = ""
 
 
@@ -123,7 +123,7 @@ WHOLE = Shard(1, 1)
 
 
 def parse_shard(text: str) -> Shard:
-    """``2/4`` as the second shard of four (raises CampaignError: it is not such a pair)."""
+    """``2/4`` as the second shard of four. Raises CampaignError: the text is not such a pair."""
     number, slash, of = text.partition("/")
     if slash and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of):
         return Shard(int(number), int(of))
@@ -131,7 +131,7 @@ def parse_shard(text: str) -> Shard:
 
 
 def parse_choice(text: str) -> tuple[str, tuple[str, ...]]:
-    """``world=hard,extreme`` as the factor and its levels (raises CampaignError: there is no factor or no level)."""
+    """``world=hard,extreme`` as the factor and its levels. Raises CampaignError: there is no factor or no level."""
     name, equals, levels = text.partition("=")
     chosen = tuple(level.strip() for level in levels.split(",") if level.strip())
     if not equals or not name.strip() or not chosen:
@@ -140,7 +140,10 @@ def parse_choice(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def cells_of(study: Study, mirrors: Sequence[str] = (), only: Mapping[str, Sequence[str]] | None = None) -> list[Cell]:
-    """The cells of a campaign; ``only``: levels to keep, by factor (raises CampaignError: the study has no such)."""
+    """The cells of a campaign; ``only``: levels to keep, by factor.
+
+    Raises CampaignError: the study has no such factor or level, or chooses its mirrors itself.
+    """
     if mirrors and not study.mirrors:
         raise CampaignError(f"study {study.name} chooses its mirrors itself; leave --mirror out")
     cells = list(study.cells())
@@ -166,9 +169,10 @@ def cells_of(study: Study, mirrors: Sequence[str] = (), only: Mapping[str, Seque
 def jobs_of(
     study: Study, cells: Iterable[Cell], load: Load, settings: Mapping[str, object], runs: int
 ) -> list[list[Job]]:
-    """The jobs of each cell, ``runs`` seeds from ``run.seed`` on in their order.
+    """The jobs of each cell, in order of seeds: ``runs`` seeds, beginning with ``run.seed``.
 
-    CampaignError: a setting would overrule a factor, or there are no runs. ConfigError: a configuration is of no use.
+    Raises CampaignError: a setting would override a factor, or there are no runs. Raises ConfigError: a configuration
+    is invalid.
     """
     if runs < 1:
         raise CampaignError(f"--runs {runs}: must be at least 1")

@@ -1,20 +1,22 @@
-"""The posterior Cramér-Rao bound of the position at the stops of a mission, computed from the truth.
+"""The posterior Cramér-Rao bound of the position at the stops of a mission, computed from the ground truth.
 
-No estimator can have a smaller mean square error than the inverse of the Bayesian information, and for a Markov process
-the recursion of Tichavský, Muravchik and Nehorai (1998) carries that information from step to step. With Gaussian
-noises it is the recursion of an extended Kalman filter whose Jacobians are taken at the true state and whose
-covariances are those of the true world. What is known here is what the robot has: wheel angles, angular rate, the
-passes over seams, the fixes, and that wheels at rest stand. Nothing comes from an estimator's configuration.
+No estimator can have a smaller mean square error than the inverse of the Bayesian information. For a Markov process the
+recursion of Tichavský, Muravchik and Nehorai (1998) gives this information for each step. With Gaussian noises it is
+the recursion of an extended Kalman filter with Jacobians at the true state and covariances of the true world. The
+measurements are those of the robot: wheel angles, angular rate, crossings of seams, fixes, and that the robot is at
+rest while its wheels are. No value comes from an estimator's configuration.
 
-What is approximated:
+Approximations:
 
-* the uniform distributions (slip of a leg, counts) count by their variance, as Gaussians;
-* the true way stands for the expectation over ways, one run for all runs with the same route;
-* the jitter of place and the curvature's transport of heading do not enter the Jacobians (1e-3 of their terms);
-* gravity is left out: with 2 degrees of noise on these slopes it says less of the heading than one pair of fixes;
-* the accelerometer is left out unless asked for: it measures the slip while the speed changes, and an estimator that
-  uses it can fall below the bound without;
-* the ``_SLOTS`` panel edges and tilts met last are remembered; one that is met again later counts as unknown.
+* uniform distributions (slip of a leg, counts) are replaced by Gaussians of the same variance;
+* the true path replaces the expectation over paths: one run represents all runs with the same route;
+* the jitter of the position and the transport of the heading by the curvature are not in the Jacobians (1e-3 of their
+  terms);
+* gravity is left out: with 2 degrees of noise on these slopes it gives less information about the heading than one pair
+  of fixes;
+* the accelerometer is left out by default: it measures the slip while the speed changes, so an estimator that uses it
+  can have a smaller error than the bound without it;
+* only the last ``_SLOTS`` panel edges and tilts are kept in the state; one that is met again later counts as unknown.
 """
 
 from array import array
@@ -34,7 +36,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.sim.plant import LEG_PAUSE_S, LEVEL_SLOPE
 from ccatp.studies.sil_run import SilRun
 
-# -- the record: true way, seams, fixes --------------------------------------------------------------------------------
+# -- the record: true path, seams, fixes -------------------------------------------------------------------------------
 
 
 (
@@ -51,27 +53,27 @@ WAY_COLUMNS = 14
 
 
 class SeamPass(NamedTuple):
-    """An edge sensor changed its value over a panel's edge."""
+    """A change of an edge sensor's value at a panel's edge."""
 
-    frame: int  # index of the row that ends the frame in which it did
+    frame: int  # index of the row that ends the frame of the change
     corner: int
     interval_s: float
-    axis: int  # of the deck, across the edge: 0 or 1
-    edge: tuple[int, PanelId, bool]  # axis, panel, and whether it is the one on the high side
+    axis: int  # deck axis across the edge: 0 or 1
+    edge: tuple[int, PanelId, bool]  # axis, panel, and whether it is the panel's edge on the high side
 
 
 class StopFix(NamedTuple):
     """A fix at rest."""
 
     frame: int
-    point: PointId | None  # None where it was not for a point
+    point: PointId | None  # None if the fix was not for a point
     panel: PanelId
-    covariance_m2: FloatArray  # of the foot (x, y), deck frame, from the lengths alone, shape (2, 2)
+    covariance_m2: FloatArray  # of the puck's foot (x, y), deck frame, from the lengths alone, shape (2, 2)
     error_m: tuple[float, float]  # true minus estimated position before the fix (x, y)
 
 
 class TrueRecord(NamedTuple):
-    """The truth of one mission; ``way``: a row per frame from the boot on, columns ``WAY_...``, shape (k, 14)."""
+    """Ground truth of one mission; ``way``: a row per frame since boot, columns ``WAY_...``, shape (k, 14)."""
 
     way: FloatArray
     passes: tuple[SeamPass, ...]
@@ -80,7 +82,7 @@ class TrueRecord(NamedTuple):
 
 
 class RecordedSilRun(SilRun):
-    """A mission with its record; everything random stays as it is without."""
+    """A mission with a record of the ground truth; it uses the same random numbers as without."""
 
     def __init__(self, cfg: Config) -> None:
         super().__init__(cfg)
@@ -95,7 +97,7 @@ class RecordedSilRun(SilRun):
         return TrueRecord(way, self._passes(way), tuple(self._fixes), self.robot.world.wheels.base_m)
 
     def _passes(self, way: FloatArray) -> tuple[SeamPass, ...]:
-        """The edges of the transitions, from the true way, its first row at t = 0; those over the rim left out."""
+        """Edges of the transitions, found on the true path, whose first row is at t = 0; without those at the rim."""
         mirror = self.mirror
         found = []
         for transition in self._transitions:
@@ -151,14 +153,14 @@ measured wheel angle, ER0, EL0: a frame before. J, JA: jitter of the heading (ra
 J0, JA0: a frame before.
 """
 _OWN = 22
-_SLOTS = 12  # edges of the seams around one panel, and the tilts of two
+_SLOTS = 12  # for the edges of the seams around one panel, and the tilts of two panels
 _STATES = _OWN + _SLOTS
 _UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
-_STILL_M = 1e-7  # a frame in which no wheel moves further is a frame at rest
+_STILL_M = 1e-7  # largest travel of a wheel in a frame at rest
 
 
 def bounds_of(cfg: Config, mirror: Mirror, record: TrueRecord, *, with_accelerometer: bool = False) -> list[FloatArray]:
-    """The bound of the covariance of (x, y) at each fix of a run, before it is used, m^2, shape (2, 2)."""
+    """Bound of the covariance of (x, y) before each fix of a run, m^2, each of shape (2, 2)."""
     return _Recursion(cfg, mirror, record, with_accelerometer).run()
 
 
@@ -212,7 +214,7 @@ class _Recursion:
     # -- motion -------------------------------------------------------------------------------------------------------
 
     def _redraw_if_ordered(self, k: int) -> None:
-        """The slips of a leg that begins."""
+        """Renew the slips at the beginning of a leg."""
         row = self._record.way[k]
         if not row[WAY_ORDERED]:
             return
@@ -224,7 +226,7 @@ class _Recursion:
         self._ordered_s = float(row[WAY_T])
 
     def _advance(self, k: int) -> None:
-        """One frame in which the wheels turn, and what the inertial unit says at its end."""
+        """One frame in which the wheels turn, with the measurements of the inertial unit at its end."""
         self._P = self._shift.dot(self._P).dot(self._shift.T)
         self._P.flat[:: _STATES + 1] += self._fresh
         right, left, turn = float(self._right_m[k]), float(self._left_m[k]), float(self._turn_rad[k])
@@ -234,7 +236,7 @@ class _Recursion:
         gx, gy = self._downhill[k]
         per_right = _per_parameter(right, radius_m, float(self._record.way[k, WAY_RIGHT_SCALE]))
         per_left = _per_parameter(left, radius_m, float(self._record.way[k, WAY_LEFT_SCALE]))
-        # How forward way and turn depend on the parameters of each wheel, and the turn on the base.
+        # Derivatives of forward travel and turn by the parameters of each wheel, and of the turn by the base.
         ahead, swing = np.zeros(_STATES), np.zeros(_STATES)
         for states, per, sign in ((_RIGHT_STATES, per_right, 1.0), (_LEFT_STATES, per_left, -1.0)):
             ahead[states] = 0.5 * per
@@ -266,13 +268,13 @@ class _Recursion:
             push[BA], push[JA], push[JA0] = 1.0, 1.0, -1.0
             rows.append(push)
             variances.append(self._world.accelerometer_sigma_m_s2**2)
-        # The rate's row refers to the parameters, which the motion leaves as they are, so it may follow it.
+        # The rate's row depends on the parameters only, which the motion does not change, so it may be used after it.
         self._P = F.dot(self._P).dot(F.T)
         for row, variance in zip(rows, variances, strict=True):
             self._update(row, variance)
 
     def _rest(self, frames: int) -> None:
-        """Frames at rest, taken together: slip wanders on, the inertial unit shows its biases."""
+        """All frames of a rest together: the varying errors change, and the inertial unit measures its biases."""
         P, world, rest_s = self._P, self._world, frames * self._frame_s
         for state, sigma, time_s in _wanderers(world):
             keep = exp(-rest_s / time_s)
@@ -307,7 +309,7 @@ class _Recursion:
         self._update(H, (speed_m_s * one.interval_s) ** 2 * _UNIFORM + jitter)
 
     def _fix(self, fix: StopFix) -> None:
-        """Position of the puck's foot; the panel under it is tilted, and the puck stands above it."""
+        """Update by the position of the puck's foot, with errors by the tilt of the panel and the puck's height."""
         tilt = (self._cfg.robot.puck_height_m * self._cfg.sim.truth.tilt_sigma_rad) ** 2
         H = np.zeros((2, _STATES))
         H[0, X] = H[1, Y] = 1.0
@@ -324,7 +326,7 @@ class _Recursion:
         P -= np.outer(PH / (float(row.dot(PH)) + variance), PH)
 
     def _slot(self, key: Hashable, variance: float) -> int:
-        """The state of an edge or a tilt; a new one takes the place of the one that was used longest ago."""
+        """State index of an edge or a tilt; a new one replaces the least recently used one."""
         known = self._nuisance
         if key in known:
             known.move_to_end(key)
@@ -345,7 +347,7 @@ _LEFT_STATES = [SL, UL, RL, EL, EL0]
 
 
 def _per_parameter(travel_m: float, radius_m: float, scale: float) -> FloatArray:
-    """Change of a wheel's travel per unit of its slips, its radius error, and the errors of its two angles."""
+    """Derivatives of a wheel's travel by its slips, its radius error, and the errors of its two angles, shape (5,)."""
     nominal_m, m_per_rad = travel_m / scale, radius_m * scale
     return np.array((-nominal_m, -nominal_m, travel_m, -m_per_rad, m_per_rad))
 
@@ -366,12 +368,12 @@ def _push_sigma(world: WorldConfig) -> float:
 
 
 def _count_variance(world: WorldConfig) -> float:
-    """Of an angle known to a count, rad^2."""
+    """Variance of an angle quantised by one count, rad^2."""
     return (2.0 * pi / world.encoder_counts_per_rev) ** 2 * _UNIFORM
 
 
 def _wanderers(world: WorldConfig) -> tuple[tuple[int, float, float], ...]:
-    """State, stationary sigma and correlation time of what wanders."""
+    """State, stationary sigma and correlation time of each Gauss-Markov process."""
     creep = world.creep_fraction * world.creep_walk_fraction
     return (
         (UR, world.slip_walk_sigma, world.slip_walk_time_s),
@@ -381,7 +383,7 @@ def _wanderers(world: WorldConfig) -> tuple[tuple[int, float, float], ...]:
 
 
 def _shift_of(world: WorldConfig, encoder_hz: float, frame_s: float) -> tuple[FloatArray, FloatArray]:
-    """What a frame does to the parameters: transition (n, n) and the diagonal of its noise (n,)."""
+    """Transition of the parameters over a frame, (n, n), and the diagonal of its noise, (n,)."""
     S, fresh = np.eye(_STATES), np.zeros(_STATES)
     for state, sigma, time_s in _wanderers(world):
         keep = exp(-frame_s / time_s)
@@ -389,7 +391,7 @@ def _shift_of(world: WorldConfig, encoder_hz: float, frame_s: float) -> tuple[Fl
     fresh[BG] = world.gyroscope_bias_walk_rad_s_sqrt_s**2 * frame_s
     fresh[BA] = world.accelerometer_bias_walk_m_s2_sqrt_s**2 * frame_s
     counts = world.encoder_counts_per_rev
-    # A counted angle is wrong by a part of a count, whatever came before; a sum of noisy rates is wrong by all of them.
+    # The error of a counted angle is part of a count, independent of the past; errors of integrated rates add up.
     for state, before in ((ER, ER0), (EL, EL0)):
         S[state, state] = S[before, before] = 0.0
         S[before, state] = 1.0 if counts else 0.0

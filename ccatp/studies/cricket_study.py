@@ -1,7 +1,7 @@
 """The studies `cricket` and `mote-sizes` of motes that map themselves.
 
 `cricket`: reproduces figures 9 to 14 of Patil et al. and compares better methods. `mote-sizes`: computing time of a
-batch map from sparse ranges, against the number of motes.
+batch map from sparse ranges as a function of the number of motes.
 """
 
 import time
@@ -23,9 +23,9 @@ from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, S
 from ccatp.studies.mote_runs import look_ahead, percentiles, run_batch, run_filter, simulate_field
 from ccatp.studies.results import LIMIT, Measure, Row, band, colour, draw_ranges, plot, write_analysis
 
-UPDATES = 300  # in figures 11 and 12, as we read them
+UPDATES = 300  # in figures 11 and 12, as read from the figures
 SHOWN = 30  # updates after which figure 14 has converged
-_ENDLESS_M = 1e-6  # a target that is never reached, so that all updates are made
+_ENDLESS_M = 1e-6  # a target that is never reached, so that all updates are done
 _PLAIN = {
     "cricket.phase2.pools": False,
     "cricket.phase2.linearisations": 1,
@@ -73,7 +73,7 @@ CASES = {
 
 
 def run_job(job: Job) -> JobOutcome:
-    """One field of one case."""
+    """Map one simulated field of one case."""
     case = CASES[str(job.factors["case"])]
     cfg = load_radio_config(None, {"system": "cricket", **case.keys}).cricket
     field = simulate_field(cfg, job.seed)
@@ -112,7 +112,7 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         "rms_of_all_m": total,
         "phase1_rms_m": float(np.median(phase1_m)) if phase1_m else None,
         "rms_at_30_m": shown_m,
-        # The error of the paper is root(mean e^2) over all coordinates; ours is that of positions.
+        # The error of the paper is the root mean square of coordinates; ours is that of positions.
         "coordinate_rms_at_30_m": None if shown_m is None else float(shown_m / np.sqrt(2.0)),
         "expected_rms_m": float(np.median([run["expected_rms_m"] for run in runs])),
         "bound_m": bound_m,
@@ -134,7 +134,7 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
 
 # -- figures ----------------------------------------------------------------------------------------------------------
 
-_CLOUD = 200  # runs shown as dots
+_CLOUD = 200  # largest number of runs shown as dots
 _FEW = ("zigzag-printed", "zigzag-p0-99", "zigzag-pooled")
 _MANY = ("adjacent-printed", "all-printed", "all-p0-99", "all-pooled")
 _TRACES = (
@@ -203,13 +203,13 @@ STUDY = Study(
 # -- mote-sizes -------------------------------------------------------------------------------------------------------
 
 SIZES = (30, 60, 120, 250, 500, 1000)
-NEIGHBOURS = 13.0  # mean number for a mote that is not at the rim
+NEIGHBOURS = 13.0  # mean number for a mote inside the field
 REACH_M, SIGMA_M = 5.5, 0.02 / 3.0
 _ROBUST = 4.0
 
 
 def run_sizes(cfg: Config, out: Path) -> dict[str, Any]:
-    """Map drawn fields of growing size, once each, and write ``result.json``, ``table.md`` and the figure."""
+    """Map random fields of increasing size, once each, and write ``result.json``, ``table.md`` and the figure."""
     began_s = time.perf_counter()
     cells = [_sized_cell(size, cfg.run.seed) for size in SIZES]
     result = write_analysis("mote-sizes", cells, " ".join(list(cells[0])[3:]), out, began_s)
@@ -223,7 +223,7 @@ def run_sizes(cfg: Config, out: Path) -> dict[str, Any]:
 
 
 def drawn_network(size: int, rng: np.random.Generator) -> tuple[RangeNetwork, FloatArray]:
-    """A random square field with ranges between near motes: its largest connected part, and the true positions."""
+    """A random square field with ranges between near motes: its largest connected part, and true positions (n, 2)."""
     side_m = REACH_M * np.sqrt(np.pi * size / NEIGHBOURS)
     places = rng.uniform(0.0, side_m, (size, 2))
     distances = np.linalg.norm(places[:, None] - places[None], axis=2)

@@ -1,4 +1,4 @@
-"""The study `damage`: the filter on windows of recorded runs, damaged as recordings are, beside the same undamaged."""
+"""The study `damage`: the filter on damaged windows of recorded runs, compared with the undamaged windows."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -28,20 +28,20 @@ from ccatp.studies.recordings import (
 WINDOW_S = 240.0
 WINDOWS = 3  # of each run, evenly spread
 SILENCE_S = 60.0
-STRAIGHT_RAD = 0.35  # turning of a way that leaves mirror images possible
+STRAIGHT_RAD = 0.35  # largest change of heading on a path that leaves mirror images possible
 EPOCH_S, LATE_S = 1e6, 1.5
 WRONG_SHARE, DELAYED_SHARE, ZERO_SHARE = 0.1, 0.25, 0.05
-DELAY_M = 3.0  # mean of what a reflected way is longer
+DELAY_M = 3.0  # mean excess of a reflected range
 MOVED_M, APART_M = 3.0, 1.0
-_NEAR, _NEAR_M = 2.0, 0.1  # so many times the undamaged error, and so much more, is recovered
-_NO_ALARM = "before the first or after the last odometry"  # so are a few readings of most recordings
+_NEAR, _NEAR_M = 2.0, 0.1  # recovered: error at most this factor times the undamaged one, plus this distance
+_NO_ALARM = "before the first or after the last odometry"  # most recordings have a few such readings
 _COVERED = 13.8  # chi-squared of two degrees of freedom, 99.9 %
 
 Tables = dict[str, Table]
 
 
 class Damage(NamedTuple):
-    """What a damage is given; it returns changed copies."""
+    """The input of a damage function, which returns a changed copy."""
 
     tables: Tables
     truth: ReferencePath | None
@@ -51,19 +51,19 @@ class Damage(NamedTuple):
     rng: np.random.Generator
 
     def where(self, kind: str, change: Callable[[FloatArray], FloatArray]) -> Tables:
-        """The tables with the rows of a kind changed, if there are any."""
+        """The tables, with the rows of one kind changed if there are any."""
         if kind not in self.tables:
             return self.tables
         return {**self.tables, kind: _with(self.tables[kind], change)}
 
     def everything(self, change: Callable[[FloatArray], FloatArray]) -> "Damage":
-        """With the rows of all tables and of the truth changed."""
+        """A copy with changed rows in all tables and in the truth."""
         tables = {kind: _with(table, change) for kind, table in self.tables.items()}
         truth = None if self.truth is None else ReferencePath(*change(np.column_stack(self.truth)).T)
         return self._replace(tables={kind: table for kind, table in tables.items() if len(table.values)}, truth=truth)
 
     def readings(self, change: Callable[[FloatArray], FloatArray]) -> "Damage":
-        """With the rows of all readings changed."""
+        """A copy with changed rows in all tables of readings."""
         changed = {kind: _with(table, change) for kind, table in self.tables.items() if kind != "odom"}
         return self._replace(tables={**self.tables, **changed})
 
@@ -89,7 +89,7 @@ def _renamed(rows: FloatArray, names: Mapping[float, float], from_s: float) -> F
 
 
 def _two_beacons(damage: Damage) -> tuple[int, int]:
-    """The surveyed one that is read most often, and the next of those that stand well away from it."""
+    """The surveyed beacon with most readings, and the one with next most that is further than APART_M from it."""
     run = damage.run
     counts = np.bincount(run.readings.beacon, minlength=len(run.beacon_ids))
     placed = sorted(
@@ -102,7 +102,7 @@ def _two_beacons(damage: Damage) -> tuple[int, int]:
 
 
 def straight(damage: Damage) -> Damage:
-    """The longest part that hardly turns: beacons on either side of it look alike to ranges."""
+    """Only the longest almost straight part: ranges do not tell on which side of it a beacon is."""
     headings = damage.track.poses[:, 2]
     spans, first = [], 0
     for last in range(len(headings)):
@@ -115,7 +115,7 @@ def straight(damage: Damage) -> Damage:
 
 
 def swapped(damage: Damage) -> Damage:
-    """Two beacons exchange their names half way."""
+    """Two beacons exchange their names in the middle of the window."""
     a, b = map(float, _two_beacons(damage))
     damage = damage.readings(lambda rows: _renamed(rows, {a: b, b: a}, damage.middle_s))
     return damage._replace(run=_exchanged(damage.run, int(a), int(b)))
@@ -129,12 +129,12 @@ def _exchanged(run: RecordedRun, a: int, b: int) -> RecordedRun:
 
 
 def misread_survey(damage: Damage) -> Damage:
-    """The survey has two beacons exchanged."""
+    """Two beacons are exchanged in the survey."""
     return damage._replace(run=_exchanged(damage.run, *_two_beacons(damage)))
 
 
 def moved(damage: Damage) -> Damage:
-    """A beacon stands elsewhere from half way on: its readings are those of the new place."""
+    """A beacon is moved in the middle of the window: later readings are those of the new place."""
     which, _ = _two_beacons(damage)
     name = damage.run.beacon_ids[which]
     old = np.array(damage.run.beacon_truth_m[name])
@@ -160,17 +160,17 @@ def moved(damage: Damage) -> Damage:
 
 
 def kidnapped(damage: Damage) -> Damage:
-    """Nothing is recorded while the vehicle drives on, and the clocks stand."""
+    """The vehicle drives on for half of SILENCE_S without any recording, and the clocks stop meanwhile."""
     begin_s, end_s = damage.middle_s, damage.middle_s + 0.5 * SILENCE_S
     return damage.everything(lambda rows: _later(_cut(rows, begin_s, end_s), begin_s, begin_s - end_s))
 
 
 def wrong_names(damage: Damage) -> Damage:
-    """A tenth of the readings has another beacon's name."""
+    """A tenth of the readings have another beacon's name."""
     count, seed = len(damage.run.beacon_ids), int(damage.rng.integers(1 << 30))
 
     def change(rows: FloatArray) -> FloatArray:
-        # Range and bearing of one reading are misread together: the draw is of its time.
+        # The random numbers depend on the time, so range and bearing of one reading get the same wrong name.
         draws = np.array([np.random.default_rng((seed, int(t_s * 1e3) & 0xFFFFFFFF)).random(2) for t_s in rows[:, 0]])
         wrong = draws[:, 0] < WRONG_SHARE
         rows[wrong, 1] = (rows[wrong, 1] + 1.0 + np.floor(draws[wrong, 1] * (count - 1))) % count
@@ -180,29 +180,29 @@ def wrong_names(damage: Damage) -> Damage:
 
 
 def odometry_gap(damage: Damage) -> Damage:
-    """The odometry is silent for a minute."""
+    """The odometry is missing for a minute."""
     begin_s = damage.middle_s
     return damage._replace(tables=damage.where("odom", lambda rows: _cut(rows, begin_s, begin_s + SILENCE_S)))
 
 
 def reading_gap(damage: Damage) -> Damage:
-    """No beacon answers for a minute."""
+    """All readings are missing for a minute."""
     begin_s = damage.middle_s
     return damage.readings(lambda rows: _cut(rows, begin_s, begin_s + SILENCE_S))
 
 
 def two_epochs(damage: Damage) -> Damage:
-    """The recorder's clock is set half way, by days."""
+    """The recorder's clock jumps by days in the middle of the window."""
     return damage.everything(lambda rows: _later(rows, damage.middle_s, EPOCH_S))
 
 
 def late_readings(damage: Damage) -> Damage:
-    """The clock of the readings is set half way, by more than a second."""
+    """The clock of the readings jumps by more than a second in the middle of the window."""
     return damage.readings(lambda rows: _later(rows, damage.middle_s, LATE_S))
 
 
 def reflected(damage: Damage) -> Damage:
-    """A quarter of the ranges is too long, exponentially distributed."""
+    """A quarter of the ranges are too long, with an exponentially distributed excess."""
 
     def change(rows: FloatArray) -> FloatArray:
         is_late = damage.rng.random(len(rows)) < DELAYED_SHARE
@@ -213,7 +213,7 @@ def reflected(damage: Damage) -> Damage:
 
 
 def zeros(damage: Damage) -> Damage:
-    """Ranges of 0 where no answer came."""
+    """A share of the ranges is 0, as after a timeout."""
 
     def change(rows: FloatArray) -> FloatArray:
         rows[damage.rng.random(len(rows)) < ZERO_SHARE, 2] = 0.0
@@ -252,7 +252,7 @@ def _undamaged(folder: str, case: int, assumed: RecordingsConfig) -> tuple[Recor
 
 
 def run_damage(job: Job) -> JobOutcome:
-    """One damaged window: which of ``OUTCOMES`` it has."""
+    """Run the filter on one damaged window; its outcome is one of ``OUTCOMES``."""
     cfg, kind, case = job.cfg, str(job.factors["damage"]), job.seed % len(CASES)
     run, track, before = _undamaged(cfg.run.data, case, cfg)
     tables, truth = events_of(run, 0.0, WINDOW_S)
@@ -275,7 +275,7 @@ def run_damage(job: Job) -> JobOutcome:
     is_near &= bool(found.beacons) and track.beacons.keys() & set(again.beacon_ids) <= found.beacons.keys()
     silent = "recovered" if is_near else "uncertain" if _covers(found, again, after) else "wrong"
     outcome = "reported" if new and not is_near else silent
-    # The warnings that a user gets who has surveyed no beacons.
+    # The outcome without the warnings of the survey, for a user who has surveyed no beacons.
     unsurveyed = silent if all("survey" in line for line in new) else outcome
     errors = {"path_m": after.trajectory_rmse_m, "beacons_m": after.beacon_rmse_m}
     return JobOutcome(values | errors | {"outcome": outcome, "unsurveyed": unsurveyed, "new": new})
@@ -286,7 +286,7 @@ def _unnumbered(line: str) -> str:
 
 
 def _covers(track: EstimatedPath, run: RecordedRun, judged: TrackEvaluation) -> bool:
-    """Whether errors of the path and of each beacon are as large as the covariances allow."""
+    """Whether the covariances allow the errors of the path and of each beacon."""
     truth = np.full((len(track.times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, track.times_s)
     known = np.isfinite(truth[:, 0])
     spread_m2 = np.trace(track.covariances[known, :2, :2], axis1=1, axis2=2)
@@ -297,7 +297,7 @@ def _covers(track: EstimatedPath, run: RecordedRun, judged: TrackEvaluation) -> 
 
 
 def combine_damage(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """How many variants had each outcome, and which were wrong."""
+    """Number of variants with each outcome, and the cases of the wrong ones."""
     runs = [outcome.values for outcome in outcomes]
     values: dict[str, Any] = {name: sum(run["outcome"] == name for run in runs) for name in OUTCOMES}
     values["wrong_unsurveyed"] = sum(run["unsurveyed"] == "wrong" for run in runs)

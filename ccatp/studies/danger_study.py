@@ -1,8 +1,9 @@
 """The study `danger`: false edges and overrun of the thesis's edge rule and of the daemon's.
 
-A cell is a mirror (width of the gaps), a speed and a way of crossing: an angle to the seam's normal, or a quarter turn
-in place whose sensors move at that speed. Both rules judge the same transits; each stops its own drives to the rim.
-Set points are constant; slip, sensors and panel edges are as in the world, creep and vibration are left out.
+A cell is a mirror (width of the gaps), a speed and a crossing: an angle to the seam's normal, or a quarter turn in
+place whose sensors move at that speed. Both rules judge the same transits; each rule has its own drives to the rim,
+which it stops. Set points are constant. Slip, sensors and panel edges are those of the world; creep and vibration are
+left out.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,18 +31,18 @@ CROSSINGS: tuple[int | str, ...] = (0, 15, 30, 45, 60, TURN)
 RULES = {"thesis": "off for 0.1 s (thesis)", "shipped": "travel against the map (ours)"}
 OFF_S = 0.1
 """Threshold of the thesis's rule: a gap of 1 cm at 0.1 m/s."""
-# What a good localizer gives the rules in a disturbed world: standard deviations, drawn once per drive.
+# Errors of the estimate that the rules get, as of a good localizer in a disturbed world: sigmas, drawn once per drive.
 POSITION_SIGMA_M, HEADING_SIGMA_RAD = 1.5e-3, 2e-3
 _SHOWN = (
     "false_edges false_edge_probability false_edge_low false_edge_high "
     "overrun_mean_mm overrun_p95_mm overrun_max_mm falls"
 )
-_MARGIN_M = 0.01  # the first sensor begins this far before a seam, the last one ends this far behind it
-_APPROACH_M = 0.03  # the first sensor begins this far before the rim
-_BESIDE_M = 0.10  # drives to the rim meet it within this of a panel's middle
-_ASKEW_RAD = 0.05  # a turn in place begins within this of an axis
-_RUN_DOWN_S = 1.0  # a robot without set point has stopped after this: a dozen time constants
-_BLIND_M = 0.4  # an edge that was not seen by now is not going to be seen
+_MARGIN_M = 0.01  # initial distance of the first sensor before a seam, final distance of the last one behind it
+_APPROACH_M = 0.03  # initial distance of the first sensor before the rim
+_BESIDE_M = 0.10  # largest distance from a panel's middle at which a drive meets the rim
+_ASKEW_RAD = 0.05  # largest initial angle to an axis of a turn in place
+_RUN_DOWN_S = 1.0  # a robot with zero set points has stopped after this time: a dozen time constants
+_BLIND_M = 0.4  # a drive ends after this distance if no edge was detected
 _DRIVES = 25  # of each kind in a job
 _TRANSITS, _RIM = 3, 4  # streams of random numbers of a seed
 _CONFIDENCE = erf(1.96 / sqrt(2.0))  # 95 %: within 1.96 standard deviations
@@ -49,7 +50,7 @@ _RESAMPLES = 2000
 
 
 def drive_frame(seq: int, t_s: float, enc: list[WheelSample], edge: list[EdgeSample]) -> Sensors:
-    """A sensors frame with what the rules read."""
+    """A sensors frame with only the fields that the rules read."""
     return Sensors(seq, t_s, [], enc, edge, None, (0.0, 0.0), 1.0, CommandEcho(0, 0.0, 0.0, False), [])
 
 
@@ -58,14 +59,14 @@ EdgeRule = Callable[[Sensors, EstimateMessage], bool]
 
 
 def off_time_rule(off_s: float) -> EdgeRule:
-    """The thesis's rule (3.4.1): an edge where a sensor has been off for the time that the gap takes at 0.1 m/s.
+    """The thesis's rule (3.4.1): an edge if a sensor is off for longer than ``off_s``, a gap's time at 0.1 m/s.
 
-    Once it is on again its time begins again.
+    The time restarts when the sensor is on again.
     """
     since_s: list[float | None] = [None] * 4
 
     def judge(frame: Sensors, estimate: EstimateMessage) -> bool:
-        del estimate  # the rule knows no map
+        del estimate  # the rule has no map
         found = False
         for t_s, *values in frame.edge:
             for k, value in enumerate(values):
@@ -82,7 +83,7 @@ def off_time_rule(off_s: float) -> EdgeRule:
 
 
 def build_rule(name: str, mirror: Mirror, cfg: Config) -> EdgeRule:
-    """A rule of ``RULES``: the thesis's, or the daemon's, which compares travel and map."""
+    """A rule of ``RULES``: the thesis's, or the daemon's, which compares the travel with the map."""
     if name == "thesis":
         return off_time_rule(OFF_S)
     monitor = DangerMonitor(mirror, cfg.robot, cfg.danger)
@@ -90,7 +91,7 @@ def build_rule(name: str, mirror: Mirror, cfg: Config) -> EdgeRule:
 
 
 class Rig:
-    """One robot on its way, with what it reads."""
+    """One simulated robot with its sensors and an estimate of its pose."""
 
     def __init__(self, mirror: Mirror, cfg: Config, start: DeckPose, rng: np.random.Generator) -> None:
         slip_rng, error_rng, sensors_rng = rng.spawn(3)
@@ -98,7 +99,7 @@ class Rig:
         radius_m, base_m = robot.wheel_radius_m, robot.wheel_base_m
         plant = Plant(mirror.surface, start, wheel_radius_m=radius_m, wheel_base_m=base_m, wheel_lag_s=lag_s)
         self.plant = plant
-        # There is no steering here, so both wheels slip alike: the angle at the edge counts, not the way there.
+        # Nothing steers here, so both wheels have the same slip: the angle at the edge matters, not the path to it.
         plant.right_scale = plant.left_scale = 1.0 - float(slip_rng.uniform(world.slip_min, world.slip_max))
         self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=lag_s)
         self._sensors.edges.place(plant)
@@ -109,7 +110,7 @@ class Rig:
         self._estimate = self._estimated()
 
     def frame(self, right_rad_s: float, left_rad_s: float) -> tuple[Sensors, EstimateMessage]:
-        """Drive one frame on these set points; what is known at its end: the frame, and the estimate before it."""
+        """Drive one frame with these set points; returns the frame and the latest estimate before it."""
         estimate, plant = self._estimate, self.plant
         t_s = self._seq * self._frame_s
         plant.step(t_s, self._frame_s, right_rad_s, left_rad_s)
@@ -122,7 +123,7 @@ class Rig:
 
     @property
     def places(self) -> list[tuple[float, float]]:
-        """Deck places of the edge sensors, m."""
+        """Positions of the edge sensors, deck frame, m."""
         return self._sensors.edges.places
 
     def _estimated(self) -> EstimateMessage:
@@ -133,7 +134,7 @@ class Rig:
         )  # fmt: skip
 
     def at_speed(self, v_m_s: float, omega_rad_s: float, cfg: Config) -> tuple[float, float]:
-        """Set points (right, left) of a twist; the wheels have them from the beginning."""
+        """Set points (right, left), rad/s, of a twist; the wheels start at these speeds."""
         r, half = cfg.robot.wheel_radius_m, 0.5 * cfg.robot.wheel_base_m
         set_points = (v_m_s + omega_rad_s * half) / r, (v_m_s - omega_rad_s * half) / r
         self.plant.right_rad_s, self.plant.left_rad_s = set_points
@@ -143,12 +144,12 @@ class Rig:
 def transit(
     mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float | None, rng: np.random.Generator
 ) -> tuple[bool, ...]:
-    """Cross a seam between two columns, or turn by a quarter beside it; whether each rule took it for an edge.
+    """Cross a seam between two columns, or make a quarter turn beside it; whether each rule reports an edge.
 
-    ``angle_rad`` is that between the way and the seam's normal; None turns in place.
+    ``angle_rad``: between the path and the seam's normal; None: turn in place.
     """
     place_rng, rig_rng = rng.spawn(2)
-    # Panels with neighbours all round their right seam: the rim is far from every way over it.
+    # Panels with neighbours all around their right seam: the rim is far from every path over it.
     around = ((0, 1), (1, 0), (1, 1), (-1, 0), (-1, 1))
     inner = [
         panel
@@ -189,9 +190,9 @@ def transit(
 def drive_to_rim(
     mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float, name: str, rng: np.random.Generator
 ) -> tuple[float, bool]:
-    """Drive over the rim until a rule sees an edge; the set points are zero one frame and the link's delays later.
+    """Drive over the rim until a rule detects an edge; set points become zero one frame and the link's delays later.
 
-    How far the furthest sensor went beyond the rim, m, and whether the robot fell.
+    Returns the overrun of the furthest sensor beyond the rim, m, and whether the robot fell.
     """
     place_rng, rig_rng = rng.spawn(2)
     at_rim = [p for p in mirror.panels.values() if PanelId(p.id.row, p.id.col + 1) not in mirror.panels]
@@ -221,7 +222,7 @@ def drive_to_rim(
 
 
 def run_job(job: Job) -> JobOutcome:
-    """So many transits, and as many drives to the rim for each rule."""
+    """``_DRIVES`` transits, and as many drives to the rim for each rule; no drives for a turn."""
     cfg, v_m_s, way, seed = job.cfg, float(job.factors["speed_m_s"]), job.factors["crossing"], job.cfg.run.seed
     mirror = build_mirror(cfg.mirror)
     angle_rad = None if way == TURN else radians(float(way))
@@ -233,7 +234,7 @@ def run_job(job: Job) -> JobOutcome:
     for name, false_edges in zip(RULES, np.sum(found, axis=0), strict=True):
         values[name] = {"false_edges": int(false_edges)}
         if angle_rad is not None:
-            # The same draws for both rules: what differs is the rule.
+            # Both rules get the same random numbers, so only the rule differs.
             drives = [
                 drive_to_rim(mirror, cfg, v_m_s, angle_rad, name, np.random.default_rng([seed, _RIM, k]))
                 for k in range(_DRIVES)
@@ -250,7 +251,7 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     arrays: dict[str, FloatArray] = {}
     for name in RULES:
         false_edges = sum(outcome.values[name]["false_edges"] for outcome in outcomes)
-        # Wilson 1927: sensible for 0 hits, too
+        # Wilson 1927: valid for zero false edges, too
         interval = binomtest(false_edges, transits).proportion_ci(_CONFIDENCE, "wilson")
         values[name] = {
             "false_edges": false_edges,

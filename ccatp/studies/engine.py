@@ -1,4 +1,4 @@
-"""Runs the jobs of a campaign and puts their outcomes together in the order of the plan, whoever worked on them."""
+"""Runs the jobs of a campaign on any number of workers, and combines their outcomes in the order of the plan."""
 
 import base64
 import fcntl
@@ -47,13 +47,13 @@ from ccatp.studies.results import plain, write_results
 
 FAILURES = "failures.txt"
 CLUSTER_TIMEOUT_S = 5.0
-_MOST_FAILURES = 5  # one bad seed must not cost a night; what fails this often is wrong everywhere
+_MOST_FAILURES = 5  # a campaign continues after fewer failures; this many indicate a general error
 
 
 def settle() -> None:
-    """Collect garbage, and exempt what is left: modules and tables stay to the end.
+    """Collect garbage, and exclude the remaining objects (modules and tables) from later collections.
 
-    A mission makes tuples by the million and hardly a cycle; going through all modules for them costs 3 % of its time.
+    A mission creates millions of tuples and hardly a reference cycle; scanning all modules takes 3 % of its time.
     """
     gc.collect()
     gc.freeze()
@@ -63,7 +63,7 @@ def settle() -> None:
 
 
 def make_out(out: Path) -> None:
-    """Make a study's directory, before any work (raises CampaignError: it cannot be made)."""
+    """Make a study's directory, before any job runs. Raises CampaignError: it cannot be made."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -71,7 +71,7 @@ def make_out(out: Path) -> None:
 
 
 class Finished(NamedTuple):
-    """A finished job, as a file has it."""
+    """A finished job, as read from a file."""
 
     fingerprint: str
     path: Path
@@ -81,10 +81,11 @@ class Finished(NamedTuple):
 
 @contextmanager
 def open_store(out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> "Iterator[JobStore]":
-    """The finished jobs in a directory, which is made if it is not there.
+    """The finished jobs in a directory, which is made if it does not exist.
 
-    Each shard writes a file of its own; all of them are read, and those in ``others`` are taken over. CampaignError:
-    ``out`` cannot be made, another campaign writes here, a directory does not exist, or a line is not a finished job.
+    Each shard writes its own file. The files of all shards are read, and those in the directories ``others``. Raises
+    CampaignError: ``out`` cannot be made, another campaign writes there, a directory does not exist, or a line is not a
+    finished job.
     """
     make_out(out)
     path = out / ("jobs.jsonl" if shard == WHOLE else f"jobs-{shard.number}of{shard.of}.jsonl")
@@ -95,7 +96,7 @@ def open_store(out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> 
             why = "another campaign writes there; wait for it or choose another --out"
             raise CampaignError(f"{path}: {why}") from error
         file.seek(0)
-        file.truncate(file.read().rfind(b"\n") + 1)  # what was being written at the last kill
+        file.truncate(file.read().rfind(b"\n") + 1)  # drops an incomplete last line of a killed campaign
         store = JobStore(file, path)
         for folder in (out, *others):
             store.read_all(folder)
@@ -103,14 +104,14 @@ def open_store(out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> 
 
 
 class JobStore:
-    """Finished jobs: one line each, safe on the disk before the next begins, so that a killed campaign continues."""
+    """Finished jobs, one line each, written to the disk at once, so that a killed campaign can continue."""
 
     def __init__(self, file: BinaryIO, path: Path) -> None:
         self._file, self._path = file, path
         self._done: dict[str, Finished] = {}
 
     def find(self, job: Job) -> Finished | None:
-        """A finished job, None where it is to do (raises CampaignError: done under other circumstances)."""
+        """A finished job, or None. Raises CampaignError: it was done with another configuration or version."""
         found = self._done.get(job.key)
         if found is not None and found.fingerprint != job.fingerprint:
             raise CampaignError(
@@ -120,7 +121,7 @@ class JobStore:
         return found
 
     def add(self, job: Job, outcome: JobOutcome, took_s: float = 0.0) -> None:
-        """Keep a finished job and its working time; returns when it is on the disk."""
+        """Write a finished job and its computing time, s; returns when it is on the disk."""
         stream = io.BytesIO()
         np.savez_compressed(stream, allow_pickle=False, **outcome.arrays)
         record = {
@@ -137,12 +138,12 @@ class JobStore:
         self._take(line, self._path)
 
     def read_all(self, folder: Path) -> None:
-        """The jobs of all shards in a directory."""
+        """Read the jobs of all shards in a directory. Raises CampaignError: no directory, or an invalid line."""
         if not folder.is_dir():
             raise CampaignError(f"{folder}: is no directory; name one that a campaign wrote")
         for path in sorted(folder.glob("jobs*.jsonl")):
             lines = path.read_bytes().split(b"\n")
-            for number, line in enumerate(lines[:-1], start=1):  # what follows the last line end is torn
+            for number, line in enumerate(lines[:-1], start=1):  # text after the last line end is incomplete
                 try:
                     self._take(line, path)
                 except (ValueError, KeyError, TypeError) as error:
@@ -159,7 +160,7 @@ class JobStore:
 
 
 def timed(run_job: Callable[[Job], JobOutcome], job: Job) -> tuple[JobOutcome, float]:
-    """Do a job; its outcome and working time, s."""
+    """Run a job; returns its outcome and computing time, s."""
     settle()
     started_s = time.perf_counter()
     try:
@@ -174,7 +175,7 @@ def timed(run_job: Callable[[Job], JobOutcome], job: Job) -> tuple[JobOutcome, f
 
 
 class JobError(Exception):
-    """What a job died of, by its message: an error with arguments of its own would end the pool as it arrives."""
+    """Message of a job's error. An exception with other arguments cannot be unpickled, which would break the pool."""
 
 
 Ended = Iterator[tuple[Job, "Future[tuple[JobOutcome, float]]"]]
@@ -182,14 +183,14 @@ Ended = Iterator[tuple[Job, "Future[tuple[JobOutcome, float]]"]]
 
 @contextmanager
 def _started(study: Study, jobs: Sequence[Job], workers: int | None, cluster: str | None) -> Iterator[Ended]:
-    """The jobs as they are finished: on the cluster, in this process (one worker), or in processes of this machine."""
+    """The jobs in order of completion, run on the cluster, in this process (one worker) or in processes."""
     count = min(workers or len(os.sched_getaffinity(0)), len(jobs))
     if count == 1 and not cluster:
         yield _in_turn(study, jobs)
         return
     with _cluster(cluster) if cluster else _pool(count) as executor:
         sent = {executor.submit(timed, study.run_job, job): job for job in jobs}
-        yield ((sent.pop(future), future) for future in as_completed(list(sent)))  # outcomes are large: none is kept
+        yield ((sent.pop(future), future) for future in as_completed(list(sent)))  # outcomes are large: do not keep any
 
 
 def _in_turn(study: Study, jobs: Sequence[Job]) -> Ended:
@@ -197,17 +198,17 @@ def _in_turn(study: Study, jobs: Sequence[Job]) -> Ended:
         future: Future[tuple[JobOutcome, float]] = Future()
         try:
             future.set_result(timed(study.run_job, job))
-        except Exception as error:  # raised when the result is taken, as by any executor
+        except Exception as error:  # raised by ``future.result``, as with any executor
             future.set_exception(error)
         yield job, future
 
 
 @contextmanager
 def _pool(count: int) -> Iterator[Executor]:
-    """Processes of this machine; on an error they are ended in the middle of their jobs."""
+    """Processes of this machine; on an error they are terminated, even during a job."""
     limit_threads()
     before = set(multiprocessing.active_children())
-    context = multiprocessing.get_context("spawn")  # a fork would inherit threads and locks in any state
+    context = multiprocessing.get_context("spawn")  # a fork would copy locks that threads hold
     executor = ProcessPoolExecutor(count, mp_context=context, initializer=prepare_worker)
     try:
         yield executor
@@ -221,7 +222,7 @@ def _pool(count: int) -> Iterator[Executor]:
 
 
 def prepare_worker() -> None:
-    """Leave Ctrl-C to the parent, and end with it however it ends."""
+    """Ignore Ctrl-C, which the parent handles, and exit when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if (parent := multiprocessing.parent_process()) is not None:
         Thread(target=lambda: (connection.wait([parent.sentinel]), os._exit(1)), daemon=True).start()
@@ -252,14 +253,14 @@ def _cluster(address: str) -> Iterator[Executor]:
 
 @dataclass(frozen=True, slots=True)
 class CampaignOptions:
-    """How a campaign is run."""
+    """Options of a campaign."""
 
     out: Path
-    runs: int | None = None  # seeds of each cell; else the study's
-    workers: int | None = None  # processes; else one for each core
+    runs: int | None = None  # seeds of each cell; None: the study's number
+    workers: int | None = None  # processes; None: one for each core
     cluster: str | None = None
     shard: Shard = WHOLE
-    others: tuple[Path, ...] = ()  # directories whose finished jobs are taken over
+    others: tuple[Path, ...] = ()  # directories whose finished jobs are used
     mirrors: tuple[str, ...] = ()
     only: Mapping[str, Sequence[str]] = field(default_factory=dict)
     settings: Mapping[str, object] = field(default_factory=dict)
@@ -267,11 +268,11 @@ class CampaignOptions:
 
 
 def run_campaign(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
-    """Do what is left of a campaign and write its results; what ``result.json`` holds.
+    """Run the jobs of a campaign that are not finished, and write its results; returns the contents of ``result.json``.
 
-    While jobs of other shards are missing it says how many, in ``missing``. Raises CampaignError (it cannot be run as
-    asked), CampaignFailed (jobs failed, a worker died, the directory cannot be written), CampaignInterrupted (Ctrl-C),
-    ClusterUnreachable, ConfigError; what is done is kept.
+    ``missing`` in the result: number of jobs of other shards that are not finished. Raises CampaignError (it cannot be
+    run as requested), CampaignFailed (jobs failed, a worker died, the directory cannot be written), CampaignInterrupted
+    (Ctrl-C), ClusterUnreachable, ConfigError; finished jobs are kept.
     """
     try:
         return _run(study, load, options)
@@ -324,7 +325,7 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
 
 
 def cell_result(study: Study, factors: Factors, outcomes: Sequence[JobOutcome]) -> CellResult:
-    """The jobs of a cell together, and what was published of it."""
+    """Combined outcomes of a cell, with its published values."""
     values, arrays = study.combine(factors, outcomes) if outcomes else JobOutcome({})
     printed = {"printed": study.published(factors)} if study.published and outcomes else {}
     return CellResult(factors, {"runs": len(outcomes), **values, **printed}, arrays)
@@ -337,7 +338,10 @@ def _print(console: Console, study: Study, text: str) -> None:
 def _run_jobs(
     study: Study, jobs: Sequence[Job], store: JobStore, console: Console, options: CampaignOptions
 ) -> list[str]:
-    """Do the jobs; a line for each that failed. Shows a bar on a terminal, a line for each tenth elsewhere."""
+    """Run the jobs; returns a line for each that failed.
+
+    Shows a progress bar on a terminal, otherwise a line for each tenth of the jobs.
+    """
     failures: list[str] = []
     began_s, total = time.monotonic(), len(jobs)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
@@ -356,7 +360,7 @@ def _run_jobs(
                 ) from error
             except CcatpError:
                 raise
-            except Exception as error:  # whatever a mission dies of, the others go on
+            except Exception as error:  # after an error of one job the others continue
                 what = str(error) if isinstance(error, JobError) else f"{type(error).__name__}: {error}"
                 failures.append(f"{job.key}: {what}")
                 with (options.out / FAILURES).open("a", encoding="utf-8") as file:

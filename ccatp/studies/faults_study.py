@@ -1,4 +1,4 @@
-"""The study `faults`: whole missions without faults, and with random ones that pass by: falls, completion."""
+"""The study `faults`: whole missions without faults and with random temporary faults: falls, completion."""
 
 import random
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import assemble
 
 LONGEST_S = 2.0
-FIRST_S = 3.0  # not before the sensors have sent anything
+FIRST_S = 3.0  # earliest begin of a fault: the sensors have sent data before
 NONE, RANDOM = "none", "random"
 FAULTS_PER_MISSION = 12
-_SPREAD = 0.3  # dots of a row lie beside each other
+_SPREAD = 0.3  # vertical spread of the dots of a row
 
 
 def random_plan(seed: int, count: int, last_s: float) -> FaultPlan:
-    """Random faults of sensors, frames, clock and wheels that pass by; a function of its arguments alone.
+    """Random temporary faults of sensors, frames, clock and wheels; the plan depends only on the arguments.
 
-    All have begun by robot time ``last_s``; each lasts at most ``LONGEST_S``.
+    All begin before robot time ``last_s``; each lasts at most ``LONGEST_S``.
     """
     rng = random.Random(f"plan {seed}")
     texts = []
@@ -67,7 +67,7 @@ def _draw(rng: random.Random) -> tuple[str, str, str]:
 
 
 def run_job(job: Job) -> JobOutcome:
-    """One mission."""
+    """Run one mission."""
     cfg, plan, mirror = job.cfg, FaultPlan(), build_mirror(job.cfg.mirror)
     if job.factors["faults"] == RANDOM:
         plan = random_plan(job.seed, FAULTS_PER_MISSION, assemble(cfg).lower_bound_s)
@@ -78,7 +78,7 @@ def run_job(job: Job) -> JobOutcome:
         "seed": job.seed,
         "outcome": found.outcome,
         "cause": found.cause,
-        # A fault that comes after the end, or between two readings of a slow sensor, does nothing.
+        # A fault after the end, or between two readings of a slow sensor, has no effect.
         "injected": {"planned": len(plan.faults), "acted": sum(one.samples > 0 for one in run.injected)},
         "is_recoverable": is_recoverable(plan, mirror),
         "weak_frames": run.weak_frames,
@@ -89,12 +89,12 @@ def run_job(job: Job) -> JobOutcome:
 
 
 def is_recoverable(plan: FaultPlan, mirror: Mirror) -> bool:
-    """Whether a mission shall go on by itself: fans that seem to fail on an overhang wait for an operator."""
+    """Whether a mission must continue without an operator: apparent failures of the fans on an overhang need one."""
     return not (mirror.overhang and any(fault.signal == "fans" for fault in plan.faults))
 
 
 def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """Sums over the missions; how those ended that were not completed."""
+    """Sums over the missions, and the causes of those that were not completed."""
     values = [outcome.values for outcome in outcomes]
     is_complete = [v["outcome"] == "complete" for v in values]
     recoverable = [v["outcome"] == "complete" for v in values if v["is_recoverable"]]
@@ -115,7 +115,7 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
 
 
 def draw(cells: Sequence[CellResult], out: Path) -> None:
-    """Figure ``faults``, the cost of faults in time: every mission a dot, those that were not completed marked."""
+    """Figure ``faults``, the cost of faults in time: a dot for each completed mission, a cross for each other one."""
     kinds = levels(cells, "faults")
     with plot(out / "faults", 7.0, 1.0 + 0.55 * len(cells)) as (axes,):
         for k, cell in enumerate(cells):

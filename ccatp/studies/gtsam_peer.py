@@ -1,8 +1,8 @@
-"""GTSAM on the same raw input as our own estimators: iSAM2 as the run goes on, Levenberg-Marquardt at its end.
+"""GTSAM on the same raw input as our own estimators: iSAM2 during the run, Levenberg-Marquardt at its end.
 
-Needs the extra ``peers`` (gtsam), imported only when it is asked for. Its stock factors know no calibration: ranges and
-odometry go in as they were recorded. Noise is the same as ours, readings are robust (Huber), beacons without bearings
-begin where our placing puts them on its own path.
+Needs the extra ``peers`` (gtsam), imported only on request. Its stock factors have no calibration, so ranges and
+odometry are used as recorded. The noise is the same as ours, with Huber's loss for the readings. Beacons without
+bearings start at a place found by trilateration on GTSAM's own path.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ HUBER = 2.0
 LEAST_READINGS = 8
 SURE_MARGIN = 8.0
 SURE_SPREAD = 0.15
-UNKNOWN = np.full((2, 2), np.nan)  # uncertainty is not asked of the peers
+UNKNOWN = np.full((2, 2), np.nan)  # covariances of the peers are not computed
 
 
 class PeerError(CcatpError):
@@ -40,14 +40,17 @@ class PeerGaveUp(CcatpError):
 
 
 class Peers(NamedTuple):
-    """The estimates of GTSAM; of iSAM2 each pose from readings up to it, and the map at the end."""
+    """The estimates of GTSAM; for iSAM2 each pose is from the readings up to it, and the map is that at the end."""
 
     isam2: EstimatedPath
     batch: EstimatedPath
 
 
 def run_gtsam(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float]) -> Peers:
-    """Both estimates of a run (raises PeerError: gtsam is not installed; PeerGaveUp: its optimisation failed)."""
+    """Both estimates of a run.
+
+    Raises PeerError: gtsam is not installed. Raises PeerGaveUp: its optimisation failed, or a reading has no range.
+    """
     gtsam = import_gtsam()
     if not np.isfinite(run.readings.range_m).all():
         raise PeerGaveUp(f"{run.name}: not all readings have a range, and GTSAM has no factor of signal strengths")
@@ -58,7 +61,7 @@ def run_gtsam(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[],
 
 
 def import_gtsam() -> Any:
-    """The module, which is large and belongs to an extra (raises PeerError: it is not installed)."""
+    """The module gtsam, which belongs to an extra. Raises PeerError: it is not installed."""
     try:
         import gtsam  # noqa: PLC0415
     except ImportError as error:
@@ -66,26 +69,26 @@ def import_gtsam() -> Any:
     return gtsam
 
 
-STARTS = 48  # directions, around the place of a range's reading, from which a beacon is sought
+STARTS = 48  # directions around the nearest reading in which a beacon is searched
 OUTLYING = 2.0  # sigmas beyond which a reading weighs less than half
-MOST_READINGS = 200  # of one beacon; more are thinned, since first places need no more
-APART = 0.1  # two minima are different places if they lie further apart than that part of the beacon's distance
+MOST_READINGS = 200  # used of one beacon; more are thinned
+APART = 0.1  # minima further apart than this share of the largest range are different places
 
 
 class Placement(NamedTuple):
-    """A beacon's first place."""
+    """Initial place of a beacon."""
 
     x_m: float
     y_m: float
-    margin: float  # by how much the next best place costs more (half a chi-squared); infinite if there is none
-    spread: float  # largest standard deviation over the distance of the nearest reading
+    margin: float  # excess cost of the second best place (half a chi-squared); infinite if there is none
+    spread: float  # largest standard deviation, relative to the distance of the nearest reading
 
 
 def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: FloatArray) -> Placement:
-    """Best of the minima of the robust cost of distances, sought from all around the nearest reading.
+    """Best minimum of the robust cost of distances, searched from all directions around the nearest reading.
 
-    A straight path leaves two mirror images that cost the same: see ``margin``. ``poses``: of the readings, shape (m,
-    3). ``distance_m``: to one beacon, shape (m,). ``variance``: of the distances, m^2, shape (m,).
+    On a straight path two mirror images have the same cost: see ``margin``. ``poses``: of the readings, shape (m, 3).
+    ``distance_m``: to one beacon, shape (m,). ``variance``: of the distances, m^2, shape (m,).
     """
     thin = max(1, -(-len(distance_m) // MOST_READINGS))
     anchors, distance, sigmas = poses[::thin, :2], distance_m[::thin], np.sqrt(variance[::thin])
@@ -150,14 +153,14 @@ class _Session:
         isam2 = self._track(self._path, final, np.array(took))
         begin_s = clock_s()
         best = gtsam.LevenbergMarquardtOptimizer(self._graph, final).optimize()
-        # its time is that of a start, which iSAM2 gives, and of the descent
+        # time of the optimisation only: iSAM2 gives its initial values
         spent = clock_s() - begin_s
         poses = np.array([(q.x(), q.y(), q.theta()) for q in map(best.atPose2, map(self._x, range(len(self._times))))])
         share = np.array([spent / max(len(self._at), 1)])
         return Peers(isam2, self._track(poses, best, share))
 
     def _read(self, row: int, graph: Any, values: Any) -> None:
-        """A reading: a factor if its beacon is placed; else it waits until the beacon can be."""
+        """Add a factor for a reading if its beacon has a place; otherwise the reading waits until it has."""
         r = self._run.readings
         beacon = int(r.beacon[row])
         if beacon not in self._placed:

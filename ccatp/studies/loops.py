@@ -1,7 +1,7 @@
 """The study `loops`: Bode plots, margins and root loci of the controllers, as in figs 3.6 to 3.9 of the thesis.
 
-The thesis judges its two loops on the plant 1/(T s + 1), from speed command to speed. What they close is the way from
-speed command to position, which has an integrator more: 1/(s (T s + 1)). The study sets both side by side, without and
+The thesis analyses its two loops with the plant 1/(T s + 1), from speed command to speed. The loops that are closed go
+from speed command to position, with an additional integrator: 1/(s (T s + 1)). The study compares both, without and
 with the delay of the link. Needs the extra ``tune`` (python-control), imported only when a system is built.
 """
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 Coefficients = tuple[float, ...]
 """A polynomial in s, highest power first."""
 
-DELAYS_FRAMES = (0, 2, 4)  # link delay there and back: none, that of the world `hard`, that of `extreme`
-LIMIT_LAGS = (0.5, 0.25, 0.1, 0.01, 0.001)  # of the wheel servo's: towards the limit T -> 0
-OMEGA_RAD_S = (1e-4, 300.0)  # the controller samples at 100 Hz: beyond 314 rad/s it has no loop
+DELAYS_FRAMES = (0, 2, 4)  # link delay in both directions: none, that of the world `hard`, that of `extreme`
+LIMIT_LAGS = (0.5, 0.25, 0.1, 0.01, 0.001)  # times the wheel servo's lag: towards the limit T -> 0
+OMEGA_RAD_S = (1e-4, 300.0)  # the controller samples at 100 Hz, so the Nyquist frequency is 314 rad/s
 GRID_POINTS = 4001
-# Of the delay, for poles and step responses only: right to 1e-5 rad up to 2 rad per delay.
+# Pade order of the delay, for poles and step responses only: accurate to 1e-5 rad up to 2 rad per delay.
 PADE_ORDER = 4
 
 
@@ -52,11 +52,11 @@ class Loop:
 
 
 class Margins(NamedTuple):
-    """What separates a loop from instability; ``inf`` where nothing does."""
+    """Stability margins of a loop; ``inf`` if there is no limit."""
 
-    gain_db: float  # by which the gain may grow before the loop becomes unstable, negative if it has to shrink
-    phase_rad: float  # the least over all gain crossovers
-    modulus: float  # the least distance of L(j w) from -1
+    gain_db: float  # change of gain that makes the loop unstable; negative if a smaller gain does
+    phase_rad: float  # smallest absolute value over all gain crossovers
+    modulus: float  # smallest distance of L(j w) from -1
     gain_crossover_rad_s: float
     phase_crossover_rad_s: float
     delay_s: float
@@ -68,15 +68,15 @@ def controller(gains: PidConfig, is_filtered: bool) -> tuple[Coefficients, Coeff
     filter_s = gains.derivative_filter_s if is_filtered and gains.kd else 0.0
     numerator: Coefficients = (gains.kd + filter_s * gains.kp, gains.kp + filter_s * gains.ki, gains.ki)
     denominator: Coefficients = (filter_s, 1.0, 0.0)
-    if gains.ki == 0.0:  # else a pole and a zero at the origin would cancel
+    if gains.ki == 0.0:  # avoids that a pole and a zero at the origin cancel
         numerator, denominator = numerator[:2], denominator[:2]
     return tuple(np.trim_zeros(numerator, "f")) or (0.0,), tuple(np.trim_zeros(denominator, "f"))
 
 
 def steering(limits: LimitsConfig, control: ControlConfig) -> PidConfig:
-    """The regulator on the line as a controller of the heading, at full speed.
+    """The line-following controller as a controller of the heading, at full speed.
 
-    Its law omega = -g v e - k theta with k = sqrt(w + 2 g v^2) and e' = v theta is C(s) = k + g v^2 / s on the heading.
+    Its law omega = -g v e - k theta, with k = sqrt(w + 2 g v^2) and e' = v theta, is C(s) = k + g v^2 / s.
     """
     pull = control.cross_track_gain_rad_m2 * limits.v_max_m_s**2
     kp = sqrt(control.heading_weight_1_s2 + 2.0 * pull)
@@ -89,8 +89,8 @@ def open_loop(
 ) -> Loop:  # fmt: skip
     """Loop of one controller on one plant, its derivative filtered or not.
 
-    The sampling of the controller itself is left out: its hold is half a frame, two degrees at the fastest crossover
-    here. So is the prediction of the commands under way: the margins with a delay are those without its help.
+    The sampling of the controller is left out: its hold is half a frame, two degrees at the fastest crossover here. The
+    prediction over commands that are not executed yet is also left out: the margins with a delay are those without it.
     """
     numerator, denominator = controller(gains, is_filtered)
     servo = (lag_s, 1.0, 0.0) if plant == "true" else (lag_s, 1.0)
@@ -99,10 +99,10 @@ def open_loop(
 
 
 def loops_of(cfg: Config) -> Iterator[Loop]:
-    """Each set of gains, axis, plant and delay; unshaped sets also on the printed plant, as the thesis analysed them.
+    """Each set of gains, axis, plant and delay; unshaped sets also on the printed plant, as analysed in the thesis.
 
-    A shaped set feeds the tracking error back around a feed-forward: the loop is that of its gains alone, its
-    derivative the speed that the estimate has anyway. On its legs the line is held by ``steering``.
+    A shaped set has a feed-forward and feeds the tracking error back: the loop is that of its gains alone, without a
+    derivative filter, because the estimate contains the speed. On a leg ``steering`` follows the line.
     """
     frame_s = 1.0 / cfg.sim.robot.frame_hz
     lag_s = cfg.robot.wheel_lag_s
@@ -112,12 +112,12 @@ def loops_of(cfg: Config) -> Iterator[Loop]:
             axes["steering"] = steering(cfg.limits, cfg.control)
         plants = ("true",) if gains.shaped else ("printed", "true")
         for (axis, pid), plant, frames in product(axes.items(), plants, DELAYS_FRAMES):
-            is_filtered = plant == "true" and not gains.shaped  # printed: as eq. 3.4; else as it is built
+            is_filtered = plant == "true" and not gains.shaped  # printed: as in eq. 3.4; true: as implemented
             yield open_loop(name, axis, pid, plant, lag_s, frames, frame_s, is_filtered=is_filtered)
 
 
 def limit_of(cfg: Config) -> Iterator[Loop]:
-    """The printed loops of the unshaped sets as the lag goes to zero, where the thesis's phase margin comes from."""
+    """The printed loops of the unshaped sets as the lag goes to zero: the origin of the thesis's phase margin."""
     for name, gains in cfg.control.gain_sets.items():
         if not gains.shaped:
             for axis, pid in (("forward", gains.forward), ("angular", gains.angular)):
@@ -134,7 +134,7 @@ def _control() -> Any:
 
 
 def system(loop: Loop) -> "TransferFunction":
-    """L(s) with the delay as a Pade approximant (raises CampaignError: python-control is not installed)."""
+    """L(s) with the delay as a Pade approximant. Raises CampaignError: python-control is not installed."""
     control = _control()
     rational = control.TransferFunction(loop.numerator, loop.denominator)
     if loop.delay_s == 0.0:
@@ -143,12 +143,12 @@ def system(loop: Loop) -> "TransferFunction":
 
 
 def margins(loop: Loop) -> Margins:
-    """Margins of the closed loop L/(1 + L), the delay exact, over the frequencies that a sampled controller has."""
+    """Margins of the closed loop L/(1 + L) with the exact delay, for frequencies in ``OMEGA_RAD_S``."""
     omega = np.geomspace(*OMEGA_RAD_S, GRID_POINTS)
     magnitude, phase = response(loop, omega)
 
     def crossings(of: Callable[[float, Loop], float], level: FloatArray) -> list[float]:
-        """Roots between the frequencies at which a level changes."""
+        """Roots of ``of`` between the frequencies of the grid at which ``level`` changes."""
         at = np.flatnonzero(np.diff(level))
         return [float(brentq(of, omega[i], omega[i + 1], args=(loop,))) for i in at]
 
@@ -164,25 +164,25 @@ def margins(loop: Loop) -> Margins:
 
 
 def is_stable(loop: Loop) -> bool:
-    """Whether every pole of L/(1 + L) lies to the left of the axis (the delay as a Pade approximant)."""
+    """Whether every pole of L/(1 + L) has a negative real part (the delay as a Pade approximant)."""
     return bool((_control().feedback(system(loop), 1).poles().real < 0.0).all())
 
 
 def overshoot(loop: Loop) -> float:
-    """Overshoot of the closed loop's unit step, as a fraction; ``inf`` where the loop is unstable."""
+    """Overshoot of the closed loop's unit step, as a fraction; ``inf`` if the loop is unstable."""
     if not is_stable(loop):
         return inf
-    # The peak comes within a few radians of the crossover; forty see a slowly decaying tail as well.
+    # The peak occurs within a few radians of the crossover frequency; forty include a slowly decaying tail.
     time_s = np.linspace(0.0, 40.0 / margins(loop).gain_crossover_rad_s, 4001)
     value = _control().step_response(_control().feedback(system(loop), 1), time_s).outputs
     return max(0.0, float(value.max()) - 1.0)
 
 
 def response(loop: Loop, omega_rad_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Magnitude and continuous phase (rad) of L(j omega), the delay exact; both shape (k,)."""
+    """Magnitude and continuous phase (rad) of L(j omega) with the exact delay, both of shape (k,)."""
     rational = _rational(loop, 1j * omega_rad_s)
     phase = np.unwrap(np.angle(rational))
-    # A loop with two integrators begins just above or just below -180 deg: bring it to the branch below zero.
+    # A loop with two integrators begins close to -180 deg, above or below: use the branch below zero.
     phase -= 2.0 * pi * np.ceil(phase[0] / (2.0 * pi) - 1e-9)
     return np.abs(rational), phase - omega_rad_s * loop.delay_s
 
@@ -202,7 +202,7 @@ def _log_gain(omega_rad_s: float, loop: Loop) -> float:
 
 
 def _half_turn(omega_rad_s: float, loop: Loop) -> float:
-    """Imaginary part of -L/|L|: zero, and changing its sign, where L is real."""
+    """Imaginary part of -L/|L|: zero, with a change of sign, where L is real."""
     s = 1j * omega_rad_s
     value = _rational(loop, s) * np.exp(-s * loop.delay_s)
     return float(-value.imag / abs(value))
@@ -210,9 +210,9 @@ def _half_turn(omega_rad_s: float, loop: Loop) -> float:
 
 _COLOURS = {"printed": "#d08c00", "true": "#123f6d"}
 _PLANTS = {"printed": "1/(Ts+1)", "true": "1/(s(Ts+1))"}
-_DASHES = ("-", "--", ":")  # by the order of the delays
+_DASHES = ("-", "--", ":")  # in order of the delays
 _DECADES = (-2.0, 2.0)  # shown around the largest gain crossover, powers of ten
-_FACTORS = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 1200)])  # of the loop gain, along a root locus
+_FACTORS = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 1200)])  # factors on the loop gain, along a root locus
 _WINDOW_CORNERS = 1.5  # the root locus shows this many times the servo's corner 1/T
 
 
@@ -228,7 +228,7 @@ def _draw_bode(loops: Sequence[Loop], found: Sequence[Margins], out: Path) -> No
             magnitude, phase = response(loop, omega)
             style = _DASHES[delays.index(loop.delay_frames) % len(_DASHES)]
             look = {"color": _COLOURS[loop.plant], "linestyle": style, "linewidth": 1.6}
-            if loop.delay_frames == 0:  # a delay leaves the magnitude as it is
+            if loop.delay_frames == 0:  # a delay does not change the magnitude
                 upper.semilogx(omega, 20.0 * np.log10(magnitude), **look)
             gain = f"{margin.gain_db:.0f} dB" if np.isfinite(margin.gain_db) else "∞"
             margin_text = f"{degrees(margin.phase_rad):.0f}°, {gain}"
@@ -248,7 +248,7 @@ def _draw_bode(loops: Sequence[Loop], found: Sequence[Margins], out: Path) -> No
 
 
 def _draw_locus(loops: Sequence[Loop], out: Path) -> None:
-    """Root loci of one controller, each plant without and with the longest delay."""
+    """Root loci of one controller for each plant, without and with the longest delay."""
     first = loops[0]
     ends = {min(loop.delay_frames for loop in loops), max(loop.delay_frames for loop in loops)}
     shown = [loop for loop in loops if loop.delay_frames in ends]
@@ -276,9 +276,9 @@ COLUMNS = """
 
 
 def run(cfg: Config, out: Path) -> dict[str, Any]:
-    """Analyse every loop of the configuration and write all files; a cell is one loop with its margins, None for none.
+    """Analyse every loop of the configuration and write all files; a cell is one loop; infinite margins are None.
 
-    CampaignError: python-control is not installed.
+    Raises CampaignError: python-control is not installed.
     """
     started_s = time.perf_counter()
     loops = list(loops_of(cfg))

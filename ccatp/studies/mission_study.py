@@ -1,9 +1,9 @@
-"""A mission as a job, and what most studies compute of missions: estimates, stops, time and danger.
+"""A mission as a job, and the statistics of missions that most studies use: estimates, stops, time and danger.
 
-Whether a filter knows how wrong it is: the mean of N values that follow chi-square with n degrees of freedom is n, and
-N times it follows chi-square with N n: between its 2.5 and 97.5 % quantiles over N the mean of a consistent filter lies
-in 95 % of the campaigns (Bar-Shalom, Li and Kirubarajan 2001, 5.4). The stops count as independent: each begins a leg
-of its own after its fix.
+Consistency of a filter: the sum of N independent chi-square values with n degrees of freedom is chi-square with N n
+degrees of freedom. So in 95 % of the campaigns the mean of a consistent filter lies between the 2.5 and 97.5 %
+quantiles of that distribution divided by N (Bar-Shalom, Li and Kirubarajan 2001, 5.4). The stops are treated as
+independent, because a new leg begins after the fix of each stop.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,36 +23,36 @@ from ccatp.studies.campaign import Arrays, Factors, Job, JobOutcome
 from ccatp.studies.results import chi_square_band
 from ccatp.studies.sil_run import SilResult, StopRow, rehearse
 
-# Columns of the array ``stops``: one row for each measurement, in the order they were taken. Errors are true minus
-# estimated, deck frame, before the fix; the covariance is that of x, y, heading, upper triangle row by row.
+# Columns of the array ``stops``: one row for each measurement, in order of time. Errors are true minus estimated, deck
+# frame, before the fix; the covariance is that of x, y, heading, upper triangle by rows.
 STOP_COLUMNS = (
     "t_s", "row", "col", "point", "approach", "error_x_m", "error_y_m", "error_heading_rad",
     "p_xx", "p_xy", "p_xh", "p_yy", "p_yh", "p_hh", "distance_m", "nis", "fix_distance_m", "arrival_m",
 )  # fmt: skip
 COLUMN = {name: index for index, name in enumerate(STOP_COLUMNS)}
 PER_DECADE = 1000
-LEAST = 1e-9  # anything smaller falls into the first bin
-BINS = 12 * PER_DECADE + 1  # up to a kilometre; anything larger falls into the last one
+LEAST = 1e-9  # smaller values fall into the first bin
+BINS = 12 * PER_DECADE + 1  # up to a kilometre; larger values fall into the last bin
 _T, _X, _Y, _HEADING, _EST_X, _EST_Y, _EST_HEADING = range(7)  # columns of a mission's track
 _PARTS = ("mean", "p50", "p99", "p99_9", "max")
 
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """The distribution of many values in little room: logarithmic bins, the same ones for all.
+    """Compact distribution of many values in fixed logarithmic bins.
 
     A mission has half a million localization errors, a campaign hundreds of missions. Bins are 1/1000 of a decade
-    wide, so a quantile is right to 0.12 %; count, mean, maximum and the share within the limit are exact.
+    wide, so a quantile is accurate to 0.12 %; count, mean, maximum and the share within the limit are exact.
     """
 
     counts: IntArray  # in each bin, shape (BINS,); bin i ends at LEAST * 10**(i / PER_DECADE)
-    total: float
-    largest: float  # 0 where there are none
-    within: int  # the thesis's requirement
+    total: float  # sum of the values
+    largest: float  # 0 without values
+    within: int  # number of values that meet the thesis's requirement
 
     @classmethod
     def of(cls, values: FloatArray) -> "Histogram":
-        """The histogram of values, shape (n,) (raises ValueError: a value is negative or not finite)."""
+        """The histogram of values, shape (n,). Raises ValueError: a value is negative or not finite."""
         if values.size and not (np.isfinite(values).all() and values.min() >= 0.0):
             raise ValueError(f"values from {values.min()} to {values.max()}: must be finite and not negative")
         places = np.ceil(PER_DECADE * np.log10(np.maximum(values, LEAST) / LEAST)).astype(np.int64)
@@ -62,29 +62,29 @@ class Histogram:
 
     @property
     def count(self) -> int:
-        """How many values."""
+        """Number of values."""
         return int(self.counts.sum())
 
     @property
     def mean(self) -> float:
-        """Their mean; NaN where there are none."""
+        """Mean of the values; NaN without values."""
         return self.total / self.count if self.count else float("nan")
 
     def quantile(self, share: float) -> float:
-        """The value that this share of the values does not exceed; NaN where there are none."""
+        """The value that this share of the values does not exceed; NaN without values."""
         if not self.count:
             return float("nan")
         place = int(np.searchsorted(np.cumsum(self.counts), share * (self.count - 1), side="right"))
         return min(float(LEAST * 10.0 ** ((place - 0.5) / PER_DECADE)), self.largest)  # the bin's middle
 
     def exceedance(self) -> tuple[FloatArray, FloatArray]:
-        """Upper ends of the bins that hold any, and the share of all that is larger, shapes (k,), for a figure."""
+        """Upper ends of the bins that are not empty, and the share of larger values, shapes (k,), for a figure."""
         bins = np.flatnonzero(self.counts)
         edges = np.asarray(LEAST * 10.0 ** (bins / PER_DECADE), dtype=np.float64)
         return edges, 1.0 - np.cumsum(self.counts[bins]) / max(self.count, 1)
 
     def to_arrays(self, name: str) -> dict[str, NDArray[np.generic]]:
-        """As arrays whose names begin with ``name``."""
+        """The histogram as arrays whose names begin with ``name``."""
         figures = np.array([self.total, self.largest, float(self.within)])
         return {f"{name}_counts": self.counts, f"{name}_figures": figures}
 
@@ -96,7 +96,7 @@ class Histogram:
 
 
 def pooled(parts: Sequence[Histogram]) -> Histogram:
-    """All of them in one."""
+    """Sum of histograms."""
     counts = np.sum([np.zeros(BINS, dtype=np.int64), *(part.counts for part in parts)], axis=0)
     largest = max((part.largest for part in parts), default=0.0)
     return Histogram(counts, sum(part.total for part in parts), largest, sum(part.within for part in parts))
@@ -111,7 +111,7 @@ def run_mission(job: Job) -> JobOutcome:
 
 
 def mission_outcome(cfg: Config, found: SilResult) -> JobOutcome:
-    """What a campaign keeps of a mission that was run with its track."""
+    """Outcome of a mission that was run with its track: values, error histograms, and the array ``stops``."""
     mirror = build_mirror(cfg.mirror)
     track = found.track
     places = [
@@ -160,7 +160,7 @@ def _stop_rows(mirror: Mirror, puck_height_m: float, stops: list[StopRow], track
 
 
 def _nees_figures(stops: FloatArray, states: int) -> dict[str, Any]:
-    """Of the first ``states`` of x, y, heading, where the covariance is positive definite."""
+    """NEES of the first ``states`` of x, y, heading, for stops with a positive definite covariance."""
     full = np.empty((len(stops), 3, 3))
     upper = np.triu_indices(3)
     full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = stops[:, COLUMN["p_xx"] : COLUMN["p_hh"] + 1]
@@ -171,10 +171,10 @@ def _nees_figures(stops: FloatArray, states: int) -> dict[str, Any]:
 
 
 def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
-    """How values (k,) compare with chi-square; those that are not finite are left out.
+    """Comparison of values (k,) with chi-square; values that are not finite are left out.
 
-    Returns ``count``; ``mean`` and ``band_95``, in which that of a consistent filter lies; ``is_within_band``; 5, 50
-    and 95 %; ``within_95_fraction``, the share below the 95 % quantile of a single value.
+    Returns ``count``; ``mean`` and ``band_95``, which contains the mean of a consistent filter; ``is_within_band``; 5,
+    50 and 95 % quantiles; ``within_95_fraction``, the share below the 95 % quantile of a single value.
     """
     known = values[np.isfinite(values)]
     if not known.size:
@@ -193,7 +193,7 @@ def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
 
 
 def combine_missions(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """Figures of a cell from its missions, see ``mission_outcome``."""
+    """Statistics of a cell from its missions, see ``mission_outcome``."""
     values = [outcome.values for outcome in outcomes]
     runs = [outcome.arrays["stops"] for outcome in outcomes]
     stops = np.concatenate(runs)
@@ -220,7 +220,7 @@ def combine_missions(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         "nees": {"pose": _nees_figures(arrivals, 3), "position": _nees_figures(arrivals, 2)},
         "nis": chi_square_figures(stops[:, COLUMN["nis"]], 2),
         "corrections": sum(v["corrections"] for v in values),
-        # Distance of the robot from its points when it left them, as the last fix shows it and in truth.
+        # Distance of the robot from its points when it left them, by the last fix and true.
         "after_correction_mm": {
             name: _mm(lasts[:, COLUMN[column]].max()) if len(lasts) else None
             for name, column in (("max", "fix_distance_m"), ("true_max", "distance_m"))
@@ -248,13 +248,13 @@ def first_arrivals(stops: FloatArray) -> FloatArray:
 
 
 def of_values(errors_m: FloatArray) -> dict[str, Any]:
-    """Distribution of some errors, mm."""
+    """Distribution of errors, mm."""
     within = round(float(np.mean(errors_m <= WITHIN_M)), 6) if errors_m.size else None
     return {**distribution(errors_m, _PARTS, scale=1e3, decimals=4), "within_10mm_fraction": within}
 
 
 def of_histogram(errors_m: Histogram) -> dict[str, Any]:
-    """The same of pooled errors."""
+    """Distribution of pooled errors, mm, as ``of_values``."""
     if not errors_m.count:
         return of_values(np.empty(0))
     figures_m = errors_m.mean, *map(errors_m.quantile, (0.5, 0.99, 0.999)), errors_m.largest
@@ -263,19 +263,19 @@ def of_histogram(errors_m: Histogram) -> dict[str, Any]:
 
 
 def rms_and_p50(squares_m2: FloatArray) -> dict[str, float | None]:
-    """Root mean square and median of distances, mm; None of none."""
+    """Root mean square and median of distances, mm; None without values."""
     if not squares_m2.size:
         return {"rms": None, "p50": None}
     return {"rms": _mm(np.sqrt(squares_m2.mean())), "p50": _mm(np.sqrt(np.median(squares_m2)))}
 
 
 def _stop_errors(rows: FloatArray) -> dict[str, float | None]:
-    """Of the estimated position at the stops, before the fix."""
+    """Errors of the estimated position at the stops, before the fix, mm."""
     return rms_and_p50(rows[:, COLUMN["error_x_m"]] ** 2 + rows[:, COLUMN["error_y_m"]] ** 2)
 
 
 def times(values: Sequence[Any]) -> dict[str, Any]:
-    """Mission time against the bound of the same path, and where the time goes; means over complete missions."""
+    """Mission time, its lower bound for the same path, and the time in each state; means over complete missions."""
     complete = [v for v in values if v["outcome"] == "complete"]
     if not complete:
         names = ("mission_time_s", "mission_time_max_s", "lower_bound_s", "time_ratio", "within_budget", "states_s")
@@ -294,13 +294,13 @@ def times(values: Sequence[Any]) -> dict[str, Any]:
 
 
 def sums(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Sums of the same counts of several runs."""
+    """Sums of counts over several runs."""
     first, *others = counts
     return {name: sum((other[name] for other in others), start=number) for name, number in first.items()}
 
 
 def dangers(values: Sequence[Any]) -> dict[str, Any]:
-    """Sums over the runs; the overrun is the largest."""
+    """Sums over the runs, and the largest overrun."""
     found = [v["danger"] for v in values]
     counts = sums({name: danger[name] for name in ("true_edges", "false_edges", "falls")} for danger in found)
     return {**counts, "max_overrun_mm": max(danger["max_overrun_mm"] for danger in found)}

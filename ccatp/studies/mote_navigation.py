@@ -1,4 +1,4 @@
-"""The study `mote-navigation`: motes map themselves, then a robot localizes by them along its route.
+"""The study `mote-navigation`: motes map themselves, then a robot uses them to localize along its route.
 
 Each job simulates a whole mission in one process, with the mission and danger rules of the daemon.
 """

@@ -1,4 +1,4 @@
-"""Self-mapping of simulated fields of motes by filter or batch: one field, and many of one configuration."""
+"""Self-mapping of simulated fields of motes by filter or batch: one field, or many of one configuration."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -110,7 +110,7 @@ class MoteRun:
 
 @dataclass(frozen=True, slots=True)
 class MoteOutlook:
-    """What the ranges determine, and the Cramér-Rao bound at the true positions, None if a direction is free."""
+    """Rank and folds of the ranges, and the Cramér-Rao bound at the true positions; None if a direction is free."""
 
     freedom: Freedom
     folds: FoldOver
@@ -134,7 +134,7 @@ def first_map(cfg: CricketConfig, field: SimulatedField, draws: int = 0) -> Firs
 def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
     """Phases 1 and 2: a first map, then the filter over distances between the first motes of the stands.
 
-    MappingError: phase 1 cannot place a mote.
+    Raises MappingError: phase 1 cannot place a mote.
     """
     plan, first = field.plan, first_map(cfg, field, cfg.phase1.draws)
     motes = list(plan.heads or plan.mapped)
@@ -351,7 +351,7 @@ def sure_rms_m(run: MoteRun) -> float:
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float]:
-    """10, 50 and 90 %."""
+    """The 10, 50 and 90 % quantiles."""
     return dict(zip(("p10", "p50", "p90"), np.percentile(values, (10, 50, 90)).tolist(), strict=True))
 
 
