@@ -1,7 +1,7 @@
-"""The studies with real physics.
+"""The studies with rigid-body physics.
 
-`physics`: whole missions by tyre, friction and thrust. `stops`: drives over the rim, and stops by command. `slides`:
-friction that falls while the robot drives or turns.
+`physics`: whole missions with different tyres, friction and thrust. `stops`: drives over the rim, and stops by command.
+`slides`: the friction falls while the robot drives or turns.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,16 +27,16 @@ from ccatp.studies.survey_studies import MISSION, SHOWN
 # -- whole missions ---------------------------------------------------------------------------------------------------
 
 MIRRORS = "fyst-m1", "fyst-m2"
-TYRES_M = {"round": 0.002, "flat": 0.0075}  # levers at which they rub: the creep of turns at a known friction
+TYRES_M = {"round": 0.002, "flat": 0.0075}  # lever arms of the tyres' friction: they give the creep of turns
 
 
 def robot_keys(mirror: str, tyre: str, friction: float, margin: float | None) -> dict[str, object]:
-    """Of the configuration, for the robot and for its physics; without a margin the thrust is the configured one."""
+    """Configuration keys for the robot and its physics; ``margin``: thrust over the least one, None: as configured."""
     keys: dict[str, object] = {"run.mirror": mirror, "sim.physics.tyre": tyre, "robot.tyre_m": TYRES_M[tyre]}
     cfg = load_config(None, {"run.mirror": mirror, "robot.friction": friction})
     thrust_n = cfg.robot.thrust_n
     if margin is not None:
-        # Rounded up: with less than the margin that is asked for, a survey is slow.
+        # Rounded up: with less than the required margin, a survey is slow.
         thrust_n = ceil(100.0 * margin * forecast_grip(cfg.robot, build_mirror(cfg.mirror)).least_n) / 100.0
     for place in ("robot", "sim.physics"):
         keys |= {f"{place}.friction": friction, f"{place}.thrust_n": thrust_n}
@@ -46,7 +46,7 @@ def robot_keys(mirror: str, tyre: str, friction: float, margin: float | None) ->
 def physics_cells() -> Sequence[Cell]:
     """Mirror, tyre, friction, and the thrust at full duty over the least that holds the robot anywhere on the mirror.
 
-    The robot's configuration has the same friction and thrust: what its builder knows.
+    The robot's configuration has the same friction and thrust as the physics.
     """
     found = []
     for name, tyre, friction, margin in product(MIRRORS, TYRES_M, (0.5, 0.6, 0.8, 1.0), (1.1, 1.3, 2.0, 3.0)):
@@ -56,7 +56,7 @@ def physics_cells() -> Sequence[Cell]:
 
 
 def draw_physics(cells: Sequence[CellResult], out: Path) -> None:
-    """Errors and time, a figure for each mirror and thrust."""
+    """Errors and time: a figure for each mirror and thrust."""
     for (mirror, margin), there in grouped(cells, "mirror", "margin").items():
         rows = rows_by(there, "tyre", "friction")
         title = f"{mirror}, {margin} times the least thrust, by friction: {SHOWN}"
@@ -82,14 +82,14 @@ PHYSICS = Study(
 
 # -- single drives ----------------------------------------------------------------------------------------------------
 
-_REST_FRAMES = 120  # before it drives: the fans run up, the accelerometer's bias is learned
+_REST_FRAMES = 120  # before a drive: the fans run up, and the accelerometer's bias is learned
 _STOP_FRAMES = 60
-_INSIDE_M = 0.25  # of the rim, where a drive begins
+_INSIDE_M = 0.25  # distance inside the rim at which a drive begins
 _SIDES_RAD = tuple(k * pi / 2.0 for k in range(4))
 
 
 class Truth(NamedTuple):
-    """``clearance_m``: of the edge sensor that is furthest out, < 0 beyond the rim."""
+    """True state; ``clearance_m``: of the edge sensor that is furthest out, negative beyond the rim."""
 
     pose: DeckPose
     clearance_m: float
@@ -97,7 +97,7 @@ class Truth(NamedTuple):
 
 
 class Drive:
-    """A robot with real physics on set points; the danger loop's monitors get its true pose. ``verdict``: the last."""
+    """A robot with rigid-body physics on set points; the danger monitors get its true pose. ``verdict``: the last."""
 
     def __init__(self, cfg: Config, mirror: Mirror, start: DeckPose) -> None:
         self._cfg, self._robot = cfg, motor_robot(cfg, start)
@@ -115,7 +115,7 @@ class Drive:
 
     @property
     def truth(self) -> Truth:
-        """How it stands on the mirror."""
+        """True pose and clearance."""
         _, _, x_m, y_m, heading_rad, *_, clearance_m, has_fallen, _ = self._robot.truth_row()
         return Truth(DeckPose(x_m, y_m, heading_rad), clearance_m, has_fallen > 0.0)
 
@@ -123,7 +123,7 @@ class Drive:
         self._robot.command_fans(self._number + 1, *self._thrust.duty)
 
     def step(self, wanted: Twist) -> None:
-        """One frame towards a twist, with the limit of acceleration; a stop is at once."""
+        """Drive one frame towards a twist, with limited acceleration; a zero speed is commanded immediately."""
         robot, cfg = self._robot, self._cfg
         most_m_s = cfg.limits.a_max_m_s2 * robot.frame_s
         ahead_m_s = min(max(wanted.v_m_s - self._speed_m_s, -most_m_s), most_m_s) + self._speed_m_s
@@ -147,7 +147,7 @@ class Drive:
         robot.drive(self._number, right, left)
 
     def set_friction(self, friction: float) -> None:
-        """Of both tyres, from now on."""
+        """Set the friction of both tyres, and reset ``slid_m``."""
         plant = self._robot.world.plant
         if isinstance(plant, PhysicsPlant):
             plant.set_friction(friction)
@@ -155,7 +155,7 @@ class Drive:
 
     @property
     def slid_m(self) -> float:
-        """How far the body has gone over its wheels since the friction was set, m."""
+        """Sliding distance of the body (its motion minus that of the wheels) since the friction was set, m."""
         return abs(self._slide_m)
 
     def _advance(self) -> None:
@@ -166,7 +166,7 @@ class Drive:
         self._slide_m += complex(plant.x_m, plant.y_m) - before_m - rolled_m * complex(plant.hx, plant.hy)
 
     def stop(self) -> float:
-        """Zeros until it stands: how far the body goes, m."""
+        """Command zero speed for ``_STOP_FRAMES``; returns the distance from begin to end, m."""
         before = self.truth.pose
         for _ in range(_STOP_FRAMES):
             self.step(Twist(0.0, 0.0))
@@ -175,7 +175,7 @@ class Drive:
 
 
 def drives_to_rim(mirror: Mirror) -> Iterator[tuple[DeckPose, bool]]:
-    """Places in front of the middle of each side, straight and at 45 degrees to it, ahead and in reverse."""
+    """Start poses before the middle of each side, straight and at 45 degrees to it; True: the drive is in reverse."""
     row, col = (mirror.rows + 1) // 2, (mirror.cols + 1) // 2
     for outward in _SIDES_RAD:
         dx, dy = round(cos(outward)), round(sin(outward))
@@ -190,7 +190,7 @@ def drives_to_rim(mirror: Mirror) -> Iterator[tuple[DeckPose, bool]]:
 
 
 def run_stops(job: Job) -> JobOutcome:
-    """Drives over the rim; and stops by command, in eight directions."""
+    """Drives over the rim, and stops by command in eight directions."""
     cfg, mirror = job.cfg, build_mirror(job.cfg.mirror)
     speed_m_s = cfg.limits.v_max_m_s
     further_m, overruns_m, falls, missed = [], [], 0, 0
@@ -220,12 +220,12 @@ def run_stops(job: Job) -> JobOutcome:
 
 
 def first_outcome(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """Nothing is random: one run is all."""
+    """The only outcome: nothing is random, so there is one run."""
     return outcomes[0]
 
 
 def draw_stops(cells: Sequence[CellResult], out: Path) -> None:
-    """Mean and largest overrun."""
+    """Figures ``stops-<mirror>``: mean and largest overrun."""
     labels = {"overrun_mm": "beyond the rim, mm", "further_mm": "since the verdict", "stop_mm": "on command"}
     measures = [
         Measure(label, (f"{key}.mean", f"{key}.max"), f"{key}.max", is_log=False) for key, label in labels.items()
@@ -236,7 +236,7 @@ def draw_stops(cells: Sequence[CellResult], out: Path) -> None:
 
 
 def stop_cells() -> Sequence[Cell]:
-    """The speed of a survey, and the one that the plan calls safe, as far as the wheels turn so fast."""
+    """Mirror, tyre, thrust, and speed: that of a survey, and the safe speed, limited by the wheels."""
     found = []
     for mirror, tyre, thrust, speed in product(MIRRORS, TYRES_M, ("1.3 x least", "shipped"), ("survey", "safe")):
         keys = robot_keys(mirror, tyre, 0.6, None if thrust == "shipped" else 1.3)
@@ -270,7 +270,7 @@ _SOON_FRAMES = 5
 
 
 def run_slides(job: Job) -> JobOutcome:
-    """The friction falls from the robot's to that of the physics, in eight directions: when that is found."""
+    """Detection of a fall of the friction from the robot's value to that of the physics, in eight directions."""
     cfg, mirror = job.cfg, build_mirror(job.cfg.mirror)
     values: dict[str, object] = {}
     ways_m, slides_m, falls = [], [], 0
@@ -298,7 +298,7 @@ def run_slides(job: Job) -> JobOutcome:
 
 
 def slide_cells() -> Sequence[Cell]:
-    """Where thrust is as little as the margin allows."""
+    """Mirrors and reduced frictions, with a thrust of 1.3 times the least one."""
     found = []
     for mirror, friction in product(MIRRORS, (0.1, 0.2, 0.3)):
         keys = robot_keys(mirror, "round", 0.6, 1.3)
@@ -307,7 +307,7 @@ def slide_cells() -> Sequence[Cell]:
 
 
 def draw_slides(cells: Sequence[CellResult], out: Path) -> None:
-    """How far it slides after it was found."""
+    """Figure ``slides``: stopping distance after the slide was detected."""
     measures = [Measure("way after that, mm", ("way_mm.mean", "way_mm.max"), "way_mm.max")]
     draw_ranges(rows_by(cells, "mirror", "friction"), measures, "Slides: mean, largest", out / "slides")
 

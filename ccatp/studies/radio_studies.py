@@ -3,9 +3,9 @@
 `radio-signals`: level against range, and bearings of the reflector, compared with Hevrdejs and Knoll 2017; every packet
 is simulated.
 
-`radio-cases`: the three experimental cases of the same slides. These print the errors of three drives in a laboratory,
-but not the drives. Ours are three paths in the same room, among the same radios, with 5 dB of static shadowing and
-reflected rays, measured with the turning reflector.
+`radio-cases`: the three experimental cases of the same slides. The slides print the errors of three drives in a
+laboratory, but not the paths. Ours are three paths in the same room, among the same radios, with 5 dB of static
+shadowing and reflected rays, measured with the rotating reflector.
 
 `radio-follow`: a moving radio is mapped and followed, compared with Auth and Hovey 2018. `radio-slam`: EKF-SLAM among
 four ZigBee radios, in two rooms, with slip and with shadowing.
@@ -492,7 +492,7 @@ ROOMS = {"3 m": room_of(3.0, 0.8), "5 m": room_of(5.0, 0.8)}
 
 
 def slam_cells() -> Sequence[Cell]:
-    """All rooms and conditions with readings every 30 steps; the small room also with readings at every step."""
+    """All conditions in the small room, with readings every 30 steps and every step; two of them in the large room."""
     return [
         Cell(
             {"room": room, "condition": condition, "every": every},

@@ -1,6 +1,6 @@
-"""The study `recordings`: estimators on the shipped sets, the whole run and again from later starts.
+"""The study `recordings`: estimators on the shipped sets, over the whole run and from later starts.
 
-Our own estimators, with ``--peers`` GTSAM's too.
+The estimators are our own ones, and with ``--peers`` those of GTSAM.
 """
 
 import re
@@ -40,15 +40,15 @@ PEERS = ("GTSAM iSAM2", "GTSAM batch")
 
 
 class EstimateError(CcatpError):
-    """Data of which an estimator makes nothing."""
+    """Data from which an estimator gets no result."""
 
     exit_status = ExitStatus.USAGE
 
 
 def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> EstimatedPath:
-    """A run through one of ``FILTERS``.
+    """Estimate a run by one of ``FILTERS``.
 
-    Raises EstimateError: the data drove the estimator beyond finite numbers, or leave it without an answer.
+    Raises EstimateError: the estimate is not finite, or the data do not determine it.
     """
     cfg = getattr(assumed, run.kind)
     try:
@@ -74,15 +74,18 @@ COMPARED = (
 
 
 def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[str]], None]) -> list[dict[str, Any]]:
-    """``COMPARED`` of our estimators and GTSAM's; without figures where GTSAM gave up, which is a warning."""
-    import_gtsam()  # before the work
+    """A row of ``COMPARED`` for each of our estimators and GTSAM's.
+
+    If GTSAM fails, its rows have no values, and there is a warning. Raises PeerError: GTSAM is not installed.
+    """
+    import_gtsam()  # fails before the computation
     tracks: list[tuple[str, EstimatedPath | None, float | None]] = []
     for name in FILTERS:
         begin_s = perf_counter()
         tracks.append((name, estimate(run, assumed, name), perf_counter() - begin_s))
     try:
         isam2, batch = run_gtsam(run, getattr(assumed, run.kind), perf_counter)
-        # The batch starts from what iSAM2 ended with, so its time is not a run's.
+        # The batch starts from the result of iSAM2, so its time is not that of a run.
         tracks += [(PEERS[0], isam2, float(isam2.update_s.sum())), (PEERS[1], batch, None)]
     except PeerGaveUp as error:
         warn([str(error)])
@@ -91,7 +94,7 @@ def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[s
     for name, track, run_s in tracks:
         data = {} if track is None else result_data(run, name, track, judge(track, run))
         if name in PEERS:
-            data["nees_mean"] = None  # they are asked for no covariances
+            data["nees_mean"] = None  # covariances of the peers are not computed
         known = {"dataset": run.name, "filter": name, "run_s": run_s, "gave_up": track is None}
         rows.append({key: data.get(key) for key in COMPARED} | known)
     return rows
@@ -101,7 +104,7 @@ def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[s
 
 
 class RecordedSet(NamedTuple):
-    """Where a set lies in the folder of recordings, and its robots."""
+    """Path of a set in the folder of recordings, and its robots."""
 
     path: str
     robots: tuple[int | None, ...] = (None,)
@@ -117,13 +120,13 @@ ANCHORS = "UWB anchors 8/14"
 ANCHOR_METHODS = {"batch": False, "batch, offset": True}
 LEVELS = "XBee scenario 1"
 LEVEL_METHODS = ("fingerprints", "fingerprints, each by the others", "path-loss sheet")
-XBEE_M = {"A": (0.0, 0.0), "B": (0.0, 4.0), "C": (4.0, 0.0)}  # a square of 4 m, as text and levels agree with
+XBEE_M = {"A": (0.0, 0.0), "B": (0.0, 4.0), "C": (4.0, 0.0)}  # corners of a square of 4 m: fits text and levels
 XBEE_ROOM = grid_points((-1.0, -1.0), (5.0, 5.0), 0.1)
 
 
 @cache
 def shipped_run(folder: str, name: str, robot: int | None) -> RecordedRun:
-    """One run of a set (raises CampaignError: no folder is given; RadioDataError: the set is not there)."""
+    """One run of a set. Raises CampaignError: no folder is given. Raises RadioDataError: the set does not exist."""
     if not folder:
         raise CampaignError("where the recordings are is not known; give --data DIR")
     return read_run(Path(folder) / SETS[name].path, None, robot)
@@ -131,9 +134,9 @@ def shipped_run(folder: str, name: str, robot: int | None) -> RecordedRun:
 
 @cache
 def shipped_window(folder: str, name: str, robot: int | None, begin_s: float, length_s: float) -> RecordedRun:
-    """A part of a run, times in s from its beginning; what is known of its first pose is the truth's, if there is one.
+    """A part of a run, times in s from the beginning of the run; its first pose is from the truth, if there is one.
 
-    The truth is not looked at by the checks of the reader.
+    The checks of the reader do not use the truth.
     """
     run = shipped_run(folder, name, robot)
     tables, truth = events_of(run, begin_s, begin_s + length_s)
@@ -141,7 +144,7 @@ def shipped_window(folder: str, name: str, robot: int | None, begin_s: float, le
 
 
 def events_of(run: RecordedRun, begin_s: float, end_s: float) -> tuple[dict[str, Table], ReferencePath | None]:
-    """What was recorded in a part of a run, as tables of events of our own CSV, and the truth of that part."""
+    """The recorded events of a part of a run, as tables of our CSV format, and the truth of that part."""
     start_s = run.steps.times_s[0]
 
     def table(*columns: FloatArray) -> Table:
@@ -161,7 +164,7 @@ def events_of(run: RecordedRun, begin_s: float, end_s: float) -> tuple[dict[str,
 
 
 def read_again(run: RecordedRun, tables: Mapping[str, Table], truth: ReferencePath | None) -> RecordedRun:
-    """Tables of events as the reader would take them, checked without the truth, which is put back behind that."""
+    """A run from tables of events, as read and checked by the reader without the truth, which is added afterwards."""
     again = checked_run(run_of_events(Path(run.name), dict(tables), run.beacon_ids), Path(run.name))
     pose = pose_of_truth(truth, again.steps, [])
     return replace(again, name=run.name, kind=run.kind, first_pose=pose, truth=truth, beacon_truth_m=run.beacon_truth_m)
@@ -169,14 +172,14 @@ def read_again(run: RecordedRun, tables: Mapping[str, Table], truth: ReferencePa
 
 # -- recordings -------------------------------------------------------------------------------------------------------
 
-START_SHARE, MOST_SHARE = 0.1, 0.8  # of the run, later for each seed; seed 0 has all of it
+START_SHARE, MOST_SHARE = 0.1, 0.8  # of the run: delay of the start per seed, largest delay; seed 0 has the whole run
 _ERRORS = {"path_m": "trajectory_rmse_m", "heading_rad": "heading_rmse_rad", "beacons_m": "beacon_rmse_m"}
 _DELAYED = {"delayed_path_m": "trajectory_rmse_m", "delayed_nees": "nees_mean"}
 _SHOWN = {"range_scale": "range_scale", "nis": "nis_mean", "nees": "nees_mean", "update_us": "update_us_p50"}
 
 
 def run_recordings(job: Job) -> JobOutcome:
-    """One estimator on one set, all of it or from a later start: means over its robots."""
+    """One estimator on one set, the whole run or from a later start: means over its robots."""
     cfg, name, estimator = job.cfg, str(job.factors["data"]), str(job.factors["estimator"])
     share = START_SHARE * job.seed
     if share > MOST_SHARE:
@@ -197,7 +200,7 @@ def run_recordings(job: Job) -> JobOutcome:
         else:
             try:
                 track = run_gtsam(run, getattr(cfg, run.kind), perf_counter)[PEERS.index(estimator)]
-            except PeerGaveUp:  # a mean over the easier runs alone would compare nothing
+            except PeerGaveUp:  # a mean over the other runs only could not be compared
                 return JobOutcome({"gave_up": True})
         run_s = perf_counter() - begin_s
         data = result_data(run, estimator, track, judge(track, run))
@@ -206,7 +209,7 @@ def run_recordings(job: Job) -> JobOutcome:
         rows.append(row | {key: late[value] for key, value in _DELAYED.items()} | {"run_s": run_s})
     values = {key: [one[key] for one in rows] for key in rows[0]}
     if estimator not in FILTERS:
-        values["nees"] = [None]  # it is asked for no covariances
+        values["nees"] = [None]  # covariances of the peers are not computed
     return JobOutcome({"robots": values, **{key: _mean(each) for key, each in values.items()}})
 
 
@@ -216,7 +219,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def _mapped_anchors(cfg: RecordingsConfig, share: float, *, with_offset: bool) -> JobOutcome:
-    """The map of surveyed anchors from the standstills of a trolley, without those before the start."""
+    """Map of surveyed anchors from the standstills of a trolley, without those before the start."""
     file = Path(cfg.run.data) / "uwb_planar/session_8_14.csv"
     cricket = load_radio_config(
         None, {"system": "cricket", "cricket.batch.estimates_offset": with_offset}, simulates=False
@@ -235,7 +238,10 @@ def _mapped_anchors(cfg: RecordingsConfig, share: float, *, with_offset: bool) -
 
 
 def _fixed_levels(folder: Path, share: float, method: str) -> JobOutcome:
-    """Places from one level of each radio, without those before the start; the test points have B and C exchanged."""
+    """Positions from one level of each radio, without those before the start.
+
+    The names B and C are exchanged in the file of test points.
+    """
     begin_s, is_by_others = perf_counter(), method == LEVEL_METHODS[1]
     known = read_level_places(folder / "Database_Scenario1.xlsx")[1]
     tests = [place.renamed({"B": "C", "C": "B"}) for place in read_level_places(folder / "Tests_Scenario1.xlsx")[1]]
@@ -256,7 +262,7 @@ def _fixed_levels(folder: Path, share: float, method: str) -> JobOutcome:
 
 
 def combine_recordings(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """The whole run, and median and 10 to 90 % of the errors over the later starts."""
+    """Values of the whole run, and median and 10 to 90 % of the errors over the later starts."""
     whole, later = dict(outcomes[0].values), [outcome.values for outcome in outcomes[1:]]
     whole["gave_up"] = sum("gave_up" in outcome.values for outcome in outcomes)
     for key in _ERRORS:
@@ -267,7 +273,7 @@ def combine_recordings(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome
 
 
 def recordings_cells(estimators: Sequence[str] = FILTERS) -> list[Cell]:
-    """Sets times estimators, the map of surveyed anchors, and places from levels (mean error as of the path)."""
+    """Sets times estimators, the map of surveyed anchors, and positions from levels (mean error as ``path_m``)."""
     cells = [Cell({"data": name, "estimator": one}) for name in SETS for one in estimators]
     others = {ANCHORS: ANCHOR_METHODS, LEVELS: LEVEL_METHODS}
     return cells + [Cell({"data": name, "estimator": one}) for name, methods in others.items() for one in methods]

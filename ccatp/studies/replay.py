@@ -1,4 +1,4 @@
-"""Replay: the events of a recorded run through a localizer, judged against the truth or against the run itself."""
+"""Replay: a localizer processes the events of a recorded run; errors against the truth or the recorded estimates."""
 
 from array import array
 from collections import Counter
@@ -25,11 +25,11 @@ from ccatp.records.summary import distribution
 from ccatp.report.html import render
 from ccatp.studies.results import value_at
 
-# Calls that may be taken back. A late fix reaches back some seconds, which are a few hundred.
+# Largest number of calls that can be undone. A late fix goes back some seconds, which are a few hundred calls.
 REACH = 2000
-# Steps in one smoother: some 30 MB at 20 states, so that going back needs little more memory than the record itself.
+# Steps in one smoother: about 30 MB at 20 states, so smoothing needs little more memory than the record itself.
 CHAPTER = 4096
-# Wheels that turn faster than this move the robot: ten times the noise of an encoder that gives rates.
+# Wheel rate above which the robot moves: ten times the noise of an encoder that gives rates.
 TURNING_RAD_S = 0.01
 _FIGURES, _DECIMALS = ("mean", "p50", "p99", "max"), 9  # of errors, mm
 REPRODUCED = 1e-9
@@ -40,14 +40,14 @@ REPRODUCED = 1e-9
 
 
 class _State(NamedTuple):
-    """A mean and its covariance: all that a smoother reads of a filter."""
+    """A mean and its covariance: the part of a filter that a smoother reads."""
 
     mean: FloatArray
     covariance: FloatArray
 
 
 class _Past(NamedTuple):
-    """The state before a call, and F, predicted mean and Q of the transition that the call was; None for an update."""
+    """The state before a call, and F, predicted mean and Q of the call's transition; None for an update."""
 
     mean: FloatArray
     covariance: FloatArray
@@ -55,11 +55,11 @@ class _Past(NamedTuple):
 
 
 class RecordingFilter:
-    """Does what the filter in it does, and records every transition of the state, so that a smoother can go back.
+    """Wraps a filter and records every transition of the state for a smoother.
 
-    A ``reset`` to a state that the filter has been in takes it back there; one before anything is recorded is the
-    beginning; any other is a transition of its own (``transition_of_reset``). The record costs 12 kB a transition at
-    20 states. ``count``: transitions so far.
+    A ``reset`` to an earlier state of the filter removes the later record. A ``reset`` before any record sets the
+    initial state. Any other one is a transition (``transition_of_reset``). The record takes 12 kB per transition at 20
+    states. ``count``: number of recorded transitions.
     """
 
     def __init__(self, filter_: Filter) -> None:
@@ -101,7 +101,7 @@ class RecordingFilter:
             self.count += 1
 
     def _take_back(self, mean: FloatArray, covariance: FloatArray) -> bool:
-        """Remove everything after the state with these arrays, where the filter has been in it."""
+        """Remove the record after the state with these arrays; False: there is no such state."""
         if mean is self.mean and covariance is self.covariance:
             return True
         past = self._past
@@ -113,9 +113,9 @@ class RecordingFilter:
         return False
 
     def smooth(self) -> Smoothed:
-        """The first three states after 0, 1, ... ``count`` transitions, given everything; (k, 3) and (k, 3, 3).
+        """The smoothed first three states after 0, 1, ... ``count`` transitions: means (k, 3), covariances (k, 3, 3).
 
-        Raises FilterDiverged where a smoothed state is not finite.
+        Raises FilterDiverged: a smoothed state is not finite.
         """
         steps = [(mean, covariance, *step) for mean, covariance, step in self._past if step is not None]
         n = len(steps)
@@ -126,30 +126,30 @@ class RecordingFilter:
             chapter, last = Smoother(end.mean.size), min(first + CHAPTER, n)
             for step in steps[first:last]:
                 chapter.record(*step)
-            found = chapter.smooth(cast(Filter, end))  # of which it reads the mean and the covariance
+            found = chapter.smooth(cast(Filter, end))  # which reads its mean and covariance only
             means[first:last], covariances[first:last] = found.means[:-1, :3], found.covariances[:-1, :3, :3]
             end = _State(found.means[0], found.covariances[0])
         return Smoothed(means, covariances)
 
 
 def added_noise(P: FloatArray, F: FloatArray, predicted: FloatArray, Q: FloatArray) -> FloatArray:
-    """Q of ``P' = F P F^T + Q`` where F is a regression and the given Q only part of what the prediction added.
+    """Q of ``P' = F P F^T + Q`` if F is a regression and the given Q only a part of the added noise.
 
-    P and ``predicted``: covariances before and after; F and Q: transition and the noise given; all (n, n).
+    P and ``predicted``: covariances before and after; F and Q: transition and given noise; all (n, n).
     """
     excess = predicted - F.dot(P).dot(F.T) - Q
     sigma = np.sqrt(np.maximum(predicted.diagonal(), 0.0))
-    # Rounding is left out, so that a state without noise stays one.
+    # Rounding is left out, so that a state without noise stays without noise.
     is_rounding = bool((np.abs(excess) <= ROUNDING * np.outer(sigma, sigma)).all())
     return Q if is_rounding else Q + excess
 
 
 def transition_of_reset(before: FloatArray, after: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """F and Q (n, n) of a reset, from the covariances (n, n) around it.
+    """F and Q (n, n) of a reset, from the covariances (n, n) before and after it.
 
-    States whose variance changed are drawn again (their rows of F are zero), the others keep what was known of them.
-    That holds where the reset left the covariance of the others as it was and cut them from those that it drew;
-    otherwise nothing before it says anything of what came after.
+    States with a changed variance are replaced (their rows of F are zero), the others are kept. This requires that the
+    covariance of the others is unchanged, and that they are uncorrelated with the replaced ones. Otherwise F is zero:
+    the state after the reset is independent of that before.
     """
     rounding = ROUNDING * np.sqrt(np.outer(after.diagonal(), after.diagonal()).clip(0.0))
     has_changed = np.abs(after - before) > rounding
@@ -167,21 +167,22 @@ def transition_of_reset(before: FloatArray, after: FloatArray) -> tuple[FloatArr
 
 @dataclass(slots=True)
 class Replayed:
-    """The estimates of a localizer for a run, each before the fix that was taken there; the same poses smoothed."""
+    """The estimates of a localizer for a run, each before the fix at that frame; the same poses smoothed."""
 
     trace: Trace
-    moving: IntArray
-    feet: FloatArray  # of fixes taken in the run: frame before, deck x, y of the origin as they show it, shape (f, 3)
+    moving: IntArray  # frames in which the wheels turn
+    feet: FloatArray  # of fixes used in the run: frame before, deck x, y of the origin by the fix, shape (f, 3)
     smoothed: Trace | None = None
     fixes: int = 0
     refused: int = 0  # by this localizer
-    set_aside: int = 0  # kept from the localizer in the run, and here
-    first_difference: tuple[float, str] | None = None  # of the fates of a fix: its time, this localizer's reason
+    set_aside: int = 0  # not given to the localizer in the run, and not here
+    # First fix that only one of run and replay used: its time, this localizer's reason (empty if it was used).
+    first_difference: tuple[float, str] | None = None
     counts: dict[str, int] = field(default_factory=dict)
 
 
 def has_smoother(cfg: Config) -> bool:
-    """Whether the whole pose is in the filter, so that a smoother can go back over it."""
+    """Whether the filter contains the whole pose, as a smoother requires."""
     return cfg.run.filter not in FOUR_STATE
 
 
@@ -191,8 +192,8 @@ def replay(
 ) -> Replayed:  # fmt: skip
     """Run the localizer of a configuration over the events of a run, from its start at base.
 
-    ``smooth`` only where ``has_smoother``. ``on_frame`` gets the robot time of each frame, s. FilterError: the smoothed
-    state is not finite, or the smoother would have to go across a restart.
+    ``smooth``: only if ``has_smoother``. ``on_frame`` gets the robot time of each frame, s. Raises FilterError: the
+    smoothed state is not finite, or the main loop was restarted within a run that is to be smoothed.
     """
     player = _Player(cfg, mirror, smooth)
     for event in events:
@@ -212,8 +213,8 @@ class _Player:
         self._wrap: Callable[[Filter], Filter] = self._record if smooth else lambda filter_: filter_
         self._localizer: Localizer = build_localizer(cfg, mirror, self._wrap)
         self._builder = TraceBuilder()
-        self._steps = array("q")  # transitions of the filter up to each frame
-        self._states = array("d")  # and x, y, heading after them
+        self._steps = array("q")  # number of transitions of the filter up to each frame
+        self._states = array("d")  # x, y, heading of the filter after them
         self._moving = array("q")
         self._feet = array("d")
         self._seq = -1
@@ -226,7 +227,7 @@ class _Player:
 
     def take_frame(self, event: Marked) -> None:
         if event.begun is not None:
-            # A main loop that took over from another one began where the robot was seen last.
+            # A main loop that took over from another one begins at the last known pose of the robot.
             if self._recording is not None and self._seq >= 0:
                 raise FilterError("the main loop was restarted within this recording, and no smoother goes across that")
             x_m, y_m, heading_rad, *sigmas = event.begun
@@ -254,7 +255,7 @@ class _Player:
     def take_fix(self, event: Fixed) -> None:
         self._fates["fixes"] += 1
         if event.was_set_aside:
-            # The mission measured again for it: that has happened, whatever this localizer would have said.
+            # The mission measured again instead; the replay follows the run, whatever this localizer would decide.
             self._fates["set_aside"] += 1
             return
         said = ""
@@ -272,7 +273,7 @@ class _Player:
 
     def result(self) -> Replayed:
         trace, smoothed = self._builder.build(self._mirror), None
-        if self._recording is not None:  # each pose corrected as the state of the filter that it was carried on from
+        if self._recording is not None:  # each pose gets the correction of the filter state from which it was predicted
             means, covariances = self._recording.smooth()
             steps = np.array(self._steps, dtype=np.int64)
             corrections = means[steps] - np.array(self._states).reshape(-1, 3)
@@ -294,17 +295,17 @@ class _Player:
 
 
 class ReplayErrors(NamedTuple):
-    """Differences of an estimate from its reference in the k frames that both have."""
+    """Differences between an estimate and its reference in the k common frames."""
 
-    distance_m: FloatArray  # along a straight line
+    distance_m: FloatArray  # straight distance
     turn_rad: FloatArray  # of the heading, in (-pi, pi]
     is_moving: NDArray[np.bool_]  # the wheels turn
     is_arrival: NDArray[np.bool_]  # the robot has just come to rest at a point for the first time
-    nees: FloatArray  # of x, y and heading: 3 in the mean where the covariance is right, NaN where there is none
+    nees: FloatArray  # of x, y and heading: mean 3 if the covariance is right; NaN without a covariance
 
 
 def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: ArrayLike) -> ReplayErrors:
-    """Compare in the frames that both have; ``arrivals``: where the robot stood at a point for the first time."""
+    """Compare in the common frames; ``arrivals``: frames at which the robot stood at a point for the first time."""
     seqs, i, j = np.intersect1d(estimate.seq, reference.seq, return_indices=True)
     offset = estimate.place[i] - reference.place[j]
     turn = estimate.pose[i, 2] - reference.pose[j, 2]
@@ -320,7 +321,7 @@ def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: Arr
 
 
 def figures(errors: ReplayErrors) -> dict[str, Any]:
-    """The figures of a table: lengths in mm, angles in mrad; None where there is nothing to take them from."""
+    """Statistics of errors: lengths in mm, angles in mrad; None without values."""
     distance_mm = 1e3 * errors.distance_m
     known = errors.nees[np.isfinite(errors.nees)]
     return {
@@ -333,7 +334,7 @@ def figures(errors: ReplayErrors) -> dict[str, Any]:
 
 
 def difference(errors: ReplayErrors) -> dict[str, Any]:
-    """How far replayed estimates are from the recorded ones, and whether that is only rounding."""
+    """Differences between replayed and recorded estimates, and whether they are only rounding."""
     distance, turn = errors.distance_m, np.abs(errors.turn_rad)
     return {
         "frames": int(distance.size),
@@ -358,10 +359,10 @@ class ReplayEvaluation(NamedTuple):
 
 
 def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
-    """Errors of recorded, replayed and smoothed estimates, and how far the replay is from the record.
+    """Errors of recorded, replayed and smoothed estimates, and the difference between replay and record.
 
-    Errors are those against the truth where every recording has one, else against the run's own estimates: then there
-    are none of the recorded ones. How far each fix was from the estimate before it is known without any truth.
+    Errors are relative to the truth if every recording has one. Otherwise they are relative to the recorded estimates,
+    which then have no errors. The distance of each fix from the estimate before it needs no truth.
     """
     has_truth = all(part.truth is not None for part in parts)
     recorded, replayed = [part.recorded for part in parts], [part.replayed.trace for part in parts]
@@ -376,7 +377,7 @@ def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
         return ReplayErrors(*(np.concatenate(column) for column in zip(*each, strict=True)))
 
     def fix_distance_mm(estimates: Sequence[Trace]) -> dict[str, float | None]:
-        """How far each fix was from the estimate before it."""
+        """Distribution of the distance of each fix from the estimate before it."""
         each = []
         for part, estimate in zip(parts, estimates, strict=True):
             seq, x, y = part.replayed.feet.T
@@ -400,7 +401,7 @@ _POSE = ("x_m", "y_m", "heading_rad")
 
 
 def table_lines(result: Mapping[str, Any]) -> list[str]:
-    """The result of ``judge`` as a table: a column for each estimate, a dash for what is not known."""
+    """The result of ``judge`` as a table: a column for each estimate, a dash for unknown values."""
     columns = [name for name in ("recorded", "replayed", "smoothed") if result[name] is not None]
     return render("replay.txt", result=result, columns=columns, text=_cell).splitlines()
 
@@ -413,7 +414,7 @@ def _cell(figures: Mapping[str, Any], key: str) -> str:
 
 
 def csv_lines(parts: Sequence[ReplayEvaluation]) -> Iterator[str]:
-    """Poses of each frame, deck frame: replayed, smoothed, recorded and true; empty where there is none."""
+    """Poses of each frame, deck frame: replayed, smoothed, recorded and true; empty cells if a pose is missing."""
     others = [f"{name}_{key}" for name in ("smoothed", "recorded", "true") for key in _POSE]
     yield ",".join(("part", "seq", "t_s", *_POSE, *others))
     for number, part in enumerate(parts, 1):

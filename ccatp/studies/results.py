@@ -1,4 +1,4 @@
-"""Files of a study: ``result.json``, ``result.npz``, ``table.md`` and figures, all in one look."""
+"""Files of a study: ``result.json``, ``result.npz``, ``table.md``, and figures in one style."""
 
 import json
 import os
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LIMIT = "#c0392b"
-# Distinguishable with any colour vision, and in print by their lightness.
+# Distinguishable with any colour vision, and in monochrome print by their lightness.
 CYCLE = ("#0b3c5d", "#d08c00", "#1d9a8a", "#b5478a", "#6b7785", "#7a3e00")
 _WHOLE = 1e4  # numbers as large as this are shown without a fraction
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON has it: numpy's numbers as Python's, what is not finite as None."""
+    """A value for JSON: numpy's numbers as Python's, numbers that are not finite as None."""
     if isinstance(value, Mapping):
         return {str(key): plain(part) for key, part in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
@@ -37,13 +37,13 @@ def plain(value: Any) -> Any:
 
 
 def chi_square_band(freedom: float) -> tuple[float, float]:
-    """Where the mean of so many normalised squares lies with 95 % probability."""
+    """95 % interval of the mean of ``freedom`` normalised squares."""
     low, high = (float(chdtri(freedom, tail)) / freedom for tail in (0.975, 0.025))
     return low, high
 
 
 def columns_of(text: str) -> list[str]:
-    """Dotted keys of figures; a line of ``text`` has some of one group, ``error_mm: mean max``, or whole keys."""
+    """Dotted keys of values; a line of ``text`` has keys of one group, ``error_mm: mean max``, or whole keys."""
     keys = []
     for line in text.strip().splitlines():
         group, colon, names = line.strip().rpartition(":")
@@ -52,7 +52,7 @@ def columns_of(text: str) -> list[str]:
 
 
 def value_at(values: Mapping[str, Any], key: str) -> Any:
-    """The value of a dotted key; None where there is none."""
+    """The value of a dotted key; None if it is missing."""
     value: Any = values
     for part in key.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
@@ -60,7 +60,7 @@ def value_at(values: Mapping[str, Any], key: str) -> Any:
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
-    """A Markdown table; floats with four digits, None as a dash, lists as intervals or remarks."""
+    """A Markdown table; floats with four digits, None as a dash, lists of floats as intervals, others as remarks."""
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     lines += [f"| {' | '.join(map(_text, row))} |" for row in rows]
     return "\n".join(lines) + "\n"
@@ -77,7 +77,7 @@ def _text(value: Any) -> str:
 
 
 def table(rows: Sequence[Mapping[str, Any]], columns: str) -> str:
-    """Cells as a Markdown table: their factors first, then the columns, headed by the keys of ``result.json``."""
+    """Cells as a Markdown table: first the factors, then the columns; the heads are the keys of ``result.json``."""
     names = list(rows[0]) if rows else ["runs"]
     keys = [*names[: names.index("runs") + 1], *columns_of(columns)]
     return markdown_table(keys, ([value_at(row, key) for key in keys] for row in rows))
@@ -89,9 +89,10 @@ def table(rows: Sequence[Mapping[str, Any]], columns: str) -> str:
 def write_results(
     study: Study, cells: Sequence[CellResult], out: Path, about: Mapping[str, Any], *, with_figures: bool
 ) -> dict[str, Any]:
-    """Write all files of a campaign, cells without a run left out of table and figures; what ``result.json`` holds.
+    """Write all files of a campaign; returns the contents of ``result.json``.
 
-    ``about`` is what else ``result.json`` says of the campaign: its wall time, jobs that are missing.
+    Cells without a run are left out of table and figures. ``about``: further values of ``result.json``, such as elapsed
+    time and number of missing jobs.
     """
     rows = [plain({**cell.factors, **cell.values}) for cell in cells]
     result: dict[str, Any] = {"study": study.name, "cells": rows, **plain(about)}
@@ -108,14 +109,14 @@ def write_results(
 def write_analysis(
     name: str, cells: Sequence[Mapping[str, Any]], columns: str, out: Path, started_s: float
 ) -> dict[str, Any]:
-    """Write ``result.json`` and ``table.md`` of a study without runs, begun at ``started_s`` of ``perf_counter``."""
+    """Write ``result.json`` and ``table.md`` of a study without runs; ``started_s``: its start by ``perf_counter``."""
     result = {"study": name, "cells": list(cells), "wall_s": time.perf_counter() - started_s}
     _write(out, result, table(cells, columns))
     return result
 
 
 def _write(out: Path, result: Mapping[str, Any], markdown: str) -> None:
-    """A reader sees the old files or the new ones, never a part of one."""
+    """Replace each file atomically: a reader sees the old or the new one, never a part."""
     texts = {"table.md": markdown, "result.json": json.dumps(result, indent=1, allow_nan=False) + "\n"}
     for name, text in texts.items():
         draft = out / f".{name}.{os.getpid()}"
@@ -132,7 +133,7 @@ def colour(index: int) -> str:
 
 
 def grouped(cells: Iterable[CellResult], *factors: str) -> dict[tuple[Any, ...], list[CellResult]]:
-    """Cells by their levels of some factors, in the order in which these come."""
+    """Cells grouped by the levels of some factors, in order of appearance."""
     groups: dict[tuple[Any, ...], list[CellResult]] = {}
     for cell in cells:
         groups.setdefault(tuple(cell.factors[factor] for factor in factors), []).append(cell)
@@ -140,7 +141,7 @@ def grouped(cells: Iterable[CellResult], *factors: str) -> dict[tuple[Any, ...],
 
 
 def levels(cells: Iterable[CellResult], factor: str) -> list[Any]:
-    """What a factor is in some cells, in the order in which it comes."""
+    """Levels of a factor in some cells, in order of appearance."""
     return list(dict.fromkeys(cell.factors[factor] for cell in cells))
 
 
@@ -149,9 +150,10 @@ def plot(
     stem: Path, width_in: float, height_in: float, rows: int = 1, columns: int = 1,
     *, title: str = "", legend: int = 0, grid: Literal["major", "both"] = "major", **shared: Any,
 ) -> "Iterator[list[Axes]]":  # fmt: skip
-    """The axes of a figure, row by row, to draw on, written as PNG and PDF at the end (raises PictureError).
+    """The axes of a new figure, row by row; at the end of the context it is written as PNG and PDF.
 
-    ``legend``: columns of a legend of the first axes below the figure. ``shared``: see ``Figure.subplots``.
+    ``legend``: number of columns of the legend below the figure, which is that of the first axes; 0: none. ``shared``:
+    see ``Figure.subplots``. Raises PictureError: a file cannot be written.
     """
     figure = new_figure(width_in, height_in)
     panels: list[Axes] = figure.subplots(rows, columns, squeeze=False, **shared).ravel().tolist()
@@ -169,24 +171,24 @@ def plot(
 def band(
     axes: "Axes", x: NDArray[Any], ends: FloatArray, shade: str, style: Literal["-", "--"] = "-", label: str = ""
 ) -> None:
-    """A line within its range: ``ends`` has low, middle and high at each x, shape (3, k)."""
+    """Draw a line with its range; ``ends``: low, middle and high at each x, shape (3, k)."""
     axes.plot(x, ends[1], color=shade, linestyle=style, linewidth=1.5, label=label)
     axes.fill_between(x, ends[0], ends[2], color=shade, alpha=0.1, linewidth=0)
 
 
 class Measure(NamedTuple):
-    """A panel of a figure of ranges; keys are those of a cell's values."""
+    """A panel of a figure of ranges; the keys are those of a cell's values."""
 
     label: str
-    ends: tuple[str, str]  # of a bar
-    middle: str  # a dot on it
-    mark: str = ""  # beside it: a bound, or what was published
-    line: float | None = None  # where all should be
+    ends: tuple[str, str]  # keys of the ends of the bar
+    middle: str  # key of the dot on the bar
+    mark: str = ""  # key of the mark: a bound, or a published value
+    line: float | None = None  # expected value
     is_log: bool = True
 
 
 class Row(NamedTuple):
-    """A line of a figure of ranges; those of a base are drawn through all others, which are compared with it."""
+    """A row of a figure of ranges; the value of a base is drawn as a line through all rows, for comparison."""
 
     label: str
     cell: CellResult
@@ -195,7 +197,7 @@ class Row(NamedTuple):
 
 
 def rows_by(cells: Sequence[CellResult], factor: str, *others: str) -> list[Row]:
-    """A row for each cell, named by its factors, a colour for each level of the first one."""
+    """A row for each cell, labelled by its factors, with a colour for each level of the first one."""
     known = levels(cells, factor)
     return [
         Row(", ".join(str(cell.factors[name]) for name in (factor, *others)), cell, known.index(cell.factors[factor]))
@@ -204,7 +206,7 @@ def rows_by(cells: Sequence[CellResult], factor: str, *others: str) -> list[Row]
 
 
 def draw_ranges(rows: Sequence[Row], measures: Sequence[Measure], title: str, stem: Path) -> None:
-    """Figures of cells beside each other, a cell a line."""
+    """Draw the values of cells: a panel for each measure, a row for each cell."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter  # noqa: PLC0415 - takes a second
 
     with plot(stem, 10.5, 0.27 * len(rows) + 1.6, 1, len(measures), title=title, sharey=True) as panels:

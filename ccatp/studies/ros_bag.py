@@ -1,4 +1,4 @@
-"""A recording and its replay as a ROS 2 bag: one message for each sample, stamps in UTC, SI units.
+"""Export of a recording and its replay as a ROS 2 bag: one message for each sample, stamps in UTC, SI units.
 
 Frames are named as in REP 105, axes as in REP 103: ``map`` is the deck frame, ``base_link`` the robot (x ahead, y left,
 z along the normal, origin on the surface). The parent of ``map`` is ``world``, the frame of the laser system.

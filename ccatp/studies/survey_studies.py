@@ -1,8 +1,9 @@
 """The studies of whole missions over their factors.
 
-`filters`: which filter in which world, against the least possible error. `time`: what order of points, speed and
-measuring time do to the hour a mission may take. `sensitivity`: what each disturbance of the world `hard` costs, alone,
-and what its absence saves. `ablation`: what each technique of estimation and control gives, by switching it off alone.
+`filters`: each filter in each world, compared with the least possible error. `time`: effect of the order of points, the
+speed and the measuring time on the mission time, which may be one hour. `sensitivity`: effect of each disturbance of
+the world `hard`, added alone to the world `thesis`, or removed alone from `hard`. `ablation`: effect of each technique
+of estimation and control, switched off alone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,14 +33,14 @@ from ccatp.survey.planning.tour_bound import tour_bound
 
 # -- filters ----------------------------------------------------------------------------------------------------------
 
-_BOUND_EVERY = 4  # the bounds cost half a mission, and differ little from one run to the next
+_BOUND_EVERY = 4  # bounds take half the time of a mission and differ little between runs: every fourth seed has them
 _SHOWN_MM = (0.01, 300.0)
 _LIMIT_MM = 10.0
 _DASHES = ("-", "--", ":")  # curves that coincide stay visible
 
 
 def run_filter_mission(job: Job) -> JobOutcome:
-    """One mission; of every fourth seed also the bounds along its true way: without and with the accelerometer."""
+    """One mission; for every fourth seed also the bounds along its true path, without and with the accelerometer."""
     if job.seed % _BOUND_EVERY != 1:
         values, arrays = run_mission(job)
         return JobOutcome(values, {**arrays, "bounds": np.empty((0, 5))})
@@ -56,13 +57,13 @@ def run_filter_mission(job: Job) -> JobOutcome:
 
 
 def combine_filters(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """The missions pooled, and their stop errors beside the bound.
+    """Statistics of the missions, and their stop errors with the bound.
 
-    Array ``bounds``: rows of t (s), the least mean square distance without and with the accelerometer (m^2), error
-    x, y (m), shape (k, 5).
+    Array ``bounds``: rows of t (s), least mean square distance without and with the accelerometer (m^2), error x, y
+    (m), shape (k, 5).
     """
     values, arrays = combine_missions(factors, outcomes)
-    # At the first point of a run the start errors count: it says little about the filter.
+    # The first point of a run is left out: its error is mainly that of the start, not of the filter.
     bounds = np.concatenate([outcome.arrays["bounds"][1:] for outcome in outcomes])
     error_rms_mm = rms_and_p50(np.sqrt(np.sum(bounds[:, 3:] ** 2, axis=1)) ** 2)["rms"]
     bound: dict[str, Any] = {
@@ -81,7 +82,7 @@ def _bound(squares_m2: FloatArray, error_rms_mm: float | None) -> dict[str, floa
 
 
 def draw_filters(cells: Sequence[CellResult], out: Path) -> None:
-    """Exceedance of localization and arrival errors, stop errors beside their bound, consistency."""
+    """Figures: exceedance of localization and arrival errors, stop errors with their bound, consistency."""
     for (mirror,), there in grouped(cells, "mirror").items():
         _draw_exceedance(there, _localization, f"Localization error on {mirror}", out / f"localization-{mirror}")
         _draw_exceedance(there, _arrival, f"First arrival error on {mirror}", out / f"arrival-{mirror}")
@@ -97,7 +98,7 @@ def _localization(cell: CellResult) -> tuple[FloatArray, FloatArray]:
 
 def _arrival(cell: CellResult) -> tuple[FloatArray, FloatArray]:
     values = np.sort(first_arrivals(cell.arrays["stops"][:, 1:])[:, COLUMN["arrival_m"]])
-    return values, 1.0 - np.arange(len(values)) / max(len(values), 1)  # this large or larger: shows the largest
+    return values, 1.0 - np.arange(len(values)) / max(len(values), 1)  # share >= the value, so the largest is shown
 
 
 def _draw_exceedance(
@@ -179,7 +180,7 @@ def run_timed_mission(job: Job) -> JobOutcome:
 
 
 def combine_times(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """The missions pooled, and the margin that the slowest leaves."""
+    """Statistics of the missions, and the time margin of the slowest one."""
     values, arrays = combine_missions(factors, outcomes)
     tour_s, budget_s = (float(outcomes[0].values[name]) for name in ("tour_bound_s", "budget_s"))
     mean_s, slowest_s = values["mission_time_s"], values["mission_time_max_s"]
@@ -193,7 +194,7 @@ def combine_times(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcom
 
 
 def draw_times(cells: Sequence[CellResult], out: Path) -> None:
-    """Where the time of a mission goes, its bounds and the budget: a bar for each cell, a figure for each mirror."""
+    """Time in each mission state, bounds and budget: a bar for each cell, a figure for each mirror."""
     known = [cell for cell in cells if cell.values["mission_time_s"] is not None]
     for (mirror,), there in grouped(known, "mirror").items():
         with plot(out / f"time-{mirror}", 8.4, 0.32 * len(there) + 1.9, legend=4) as (axes,):
@@ -212,7 +213,7 @@ def draw_times(cells: Sequence[CellResult], out: Path) -> None:
                     axes.plot([bound_s] * 2, ends, color=INK, linestyle=style, label=label)
                 axes.text(left_s, place, f"  {cell.values['time_ratio']:.3f}", va="center", fontsize=7, color=QUIET)
             budget_s = there[0].values["budget_s"]
-            if max(cell.values["mission_time_s"] for cell in there) > 0.4 * budget_s:  # a few panels take no hour
+            if max(cell.values["mission_time_s"] for cell in there) > 0.4 * budget_s:  # not for a few panels only
                 axes.axvline(budget_s, color=LIMIT, linewidth=1.2, label="budget")
             factors = [cell.factors for cell in there]
             names = [f"{f['order']}, {f['v_max_m_s']:.2f} m/s, {f['measuring_time_s']:.1f} s" for f in factors]
@@ -248,7 +249,7 @@ TIME = Study(
 
 # -- sensitivity ------------------------------------------------------------------------------------------------------
 
-# What belongs together, as keys of a world.
+# Groups of keys of a world.
 GROUPS = {
     "encoder counts": ("encoder_sigma_rad_s", "encoder_counts_per_rev"),
     "gyroscope": ("gyroscope_bias_sigma_rad_s", "gyroscope_bias_walk_rad_s_sqrt_s", "gyroscope_scale_sigma"),
@@ -261,12 +262,12 @@ GROUPS = {
     "panel edges": ("panel_edge_sigma_m",),
 }
 ALL_ON = "nothing"
-_BASES = {"none": "world {}", "all": "world {}", ALL_ON: "with all"}  # nothing is changed, and how it is labelled
+_BASES = {"none": "world {}", "all": "world {}", ALL_ON: "with all"}  # levels without a change, and their labels
 WORLDS = ("thesis", "hard")
 
 
 def sensitivity_cells() -> Sequence[Cell]:
-    """The quiet world, each group added to it; the hard world, each group taken from it."""
+    """The quiet world, alone and with each group added; the hard world, alone and with each group removed."""
     quiet, hard = (load_config(None, {"run.world": name}).world for name in ("thesis", "hard"))
     found = []
     for base, whole, sign, other in (("thesis", "none", "plus", hard), ("hard", "all", "minus", quiet)):
@@ -291,7 +292,7 @@ SHOWN = "mean (dot), 99th percentile (end of the bar)"
 
 
 def _drawing(name: str, factor: str, groups: Sequence[str], title: str) -> Callable[[Sequence[CellResult], Path], None]:
-    """Draws a figure ``<name>-<levels>`` for all levels of ``groups``, a line for each level of a factor."""
+    """A function that draws a figure for all levels of ``groups``, with a row for each level of a factor."""
 
     def draw(cells: Sequence[CellResult], out: Path) -> None:
         for found, there in grouped(cells, *groups).items():
@@ -302,7 +303,7 @@ def _drawing(name: str, factor: str, groups: Sequence[str], title: str) -> Calla
 
 
 def _row(cell: CellResult, factor: str) -> Row:
-    """A colour for each world; the cells in which nothing is changed are lines through all others."""
+    """A row with a colour for each world; cells without a change are the base."""
     world, level = str(cell.factors["world"]), str(cell.factors[factor])
     label = {"group": level, "without": f"without {level}"}[factor]
     return Row(_BASES.get(level, label).format(world), cell, WORLDS.index(world), level in _BASES)
@@ -330,7 +331,7 @@ SENSITIVITY = Study(
 # -- ablation ---------------------------------------------------------------------------------------------------------
 
 _USE = "localizer.full_state.use"
-# What is off, and the keys that switch it off.
+# Technique that is switched off, and the keys that do so.
 WITHOUT: Mapping[str, Mapping[str, object]] = {
     ALL_ON: {},
     "zero-velocity updates": {f"{_USE}.zero_velocity": False},

@@ -1,15 +1,16 @@
-"""The study `thesis`: the thesis's simulation again, its five runs of 36 waypoints beside its own figures.
+"""The study `thesis`: the thesis's simulation repeated, five runs of 36 waypoints compared with its published values.
 
-Four panels, its filter, its control, and two readings of what it prints; a cell with one of them off shows its effect:
+Four panels, the thesis's filter and control, and two interpretations of its text. Cells with one of them switched off
+show its effect:
 
-* ``noise_is_variance``: eq. 2.17 calls sigma a variance; then a sensor's standard deviation is the root of what table
-  2.1 lists. The filter's R follows, as the thesis adjusts it.
-* ``period_error``: the filter's time step is 10 ms, the loop takes longer by this part of it. The true robot moves for
-  longer than the filter believes; control and rules keep the true time.
+* ``noise_is_variance``: eq. 2.17 calls sigma a variance. Then a sensor's standard deviation is the square root of the
+  value in table 2.1. The filter's R is the same, as in the thesis.
+* ``period_error``: the filter's time step is 10 ms, but the loop takes longer by this fraction. So the true robot moves
+  longer than the filter assumes; control and rules use the true time.
 
 Both are properties of that simulation. A daemon that reads the time stamps of the samples has no period error. As in
-thesis 2.1.5 the angle at a seam replaces the heading here, however sure the filter is of another. The cells of the
-system ``ours`` are the same waypoints and the same noise with the daemon's own filter and control.
+thesis 2.1.5 the angle at a seam replaces the heading here, however certain the filter is. The cells of the system
+``ours`` have the same waypoints and noise, with the daemon's filter and control.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,8 +43,8 @@ POINTS, PANELS = 36, 4
 _TABLE = {"normal": (0.0059, 0.0087, 0.001), "twice": (0.0118, 0.0175, 0.002)}
 _WORLDS = {"normal": "thesis", "twice": "thesis-x2"}
 _SENSORS = ("accelerometer_sigma_m_s2", "gyroscope_sigma_rad_s", "encoder_sigma_rad_s")
-# A block of 2 x 2 panels of thesis-m1 with others all round it: no rim within reach of a robot that turns.
-_BLOCK = (3, 4)  # its rows and columns, of the parity of the mirror's first ones (table 3.1)
+# A block of 2 x 2 panels of thesis-m1 with other panels all around it: a turning robot cannot reach the rim.
+_BLOCK = (3, 4)  # its rows and columns, with the same parity as the mirror's first ones (table 3.1)
 _SIDE = 6
 _LAYOUT: dict[str, object] = {
     "run.mirror": "thesis-m1",
@@ -61,8 +62,8 @@ def overrides_of(
 ) -> dict[str, object]:
     """Dotted configuration keys of one set-up.
 
-    ``noise``: ``normal`` or ``twice``. ``period_error``: by which part of the filter's step the loop takes longer.
-    ``is_ours``: the daemon's filter and control in the same set-up, all encoder samples included.
+    ``noise``: ``normal`` or ``twice``. ``period_error``: fraction of the filter's step by which the loop takes longer.
+    ``is_ours``: the daemon's filter and control in the same set-up, with all encoder samples.
     """
     sigmas = [sqrt(value) if noise_is_variance else value for value in _TABLE[noise]]
     keys: dict[str, object] = {**_LAYOUT, "run.world": _WORLDS[noise]}
@@ -74,9 +75,9 @@ def overrides_of(
     return keys | {
         "run.filter": "kf",
         "control.gains": "thesis",
-        "mission.max_approaches": 1,  # the thesis corrects no stop
+        "mission.max_approaches": 1,  # the thesis has no correction moves
         "sim.robot.frame_hz": frame_hz,
-        # Thesis 2.1.4: of each sensor only the sample with the latest time stamp is used, one per frame.
+        # Thesis 2.1.4: only the latest sample of each sensor is used, one per frame.
         "sim.robot.imu_hz": frame_hz,
         "sim.robot.encoder_hz": frame_hz,
         "sim.robot.edge_hz": 10.0 * frame_hz,
@@ -84,15 +85,15 @@ def overrides_of(
 
 
 class ThesisLocalizer(FourStateLocalizer):
-    """The four-state localizer, closer to the letter of the thesis."""
+    """The four-state localizer with the period error and the heading replacement of the thesis."""
 
-    period_factor = 1.0  # its clock is its own: a step of so many times 10 ms counts as 10 ms
+    period_factor = 1.0  # a step of this many times 10 ms is processed as 10 ms
 
     def step(
         self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample], edges: Sequence[EdgeSample],
         gravity: GravitySample | None = None,
     ) -> None:  # fmt: skip
-        """Take one sensors frame; see ``FourStateLocalizer.step``."""
+        """Process one sensors frame; see ``FourStateLocalizer.step``."""
         k = 1.0 / self.period_factor
         super().step(
             k * t_s,
@@ -107,7 +108,7 @@ class ThesisLocalizer(FourStateLocalizer):
         return super().fuse_fix(replace(fix, t_s=fix.t_s / self.period_factor))
 
     def _use_crossings(self, transitions: Sequence[SensorTransition]) -> None:
-        """Thesis 2.1.5: the angle at the seam is the heading from now on."""
+        """Thesis 2.1.5: the angle at the seam replaces the heading."""
         filter_ = self._filter
         theta = float(filter_.mean[THETA])
         seen = self._crossings.headings(transitions, self._odometer, self.pose, self.deck_pose, self.speed_m_s)
@@ -121,7 +122,7 @@ class ThesisLocalizer(FourStateLocalizer):
 
 
 class _NoEdges(DangerMonitor):
-    """Permits everything: far from the rim an edge that a rule sees is a false one, and would end the run."""
+    """Permits all motion: far from the rim every detected edge is a false one, and would end the run."""
 
     def step(self, sensors: Sensors, estimate: EstimateMessage | None) -> Verdict:
         del estimate
@@ -129,7 +130,7 @@ class _NoEdges(DangerMonitor):
 
 
 class _Replica(SilRun):
-    """A mission over the block's waypoints that may have the period error; ``run.panels`` counts the block's."""
+    """A mission over the block's waypoints, with a period error for ``kf``; ``run.panels``: of the block, 0: all."""
 
     def __init__(self, cfg: Config, period_error: float) -> None:
         panels = cfg.run.panels
@@ -158,17 +159,17 @@ PUBLISHED: dict[str, dict[str, dict[str, float]]] = {
         "waypoint": {"within_10mm_fraction": 0.8333, "mean": 7.1, "max": 42.9},
     },
 }
-RUNS = {"localization": 1, "waypoint": 5}  # behind the published figures
-# The first is what brings this replica closest to the published figures. How long that loop took is not known: another
-# simulation of the same text came closest with the second.
+RUNS = {"localization": 1, "waypoint": 5}  # number of runs of the published values
+# With the first one this simulation is closest to the published values; with the second one another simulation of the
+# same text was closest. The true period of that loop is not known.
 PERIOD_ERRORS = (0.008, 0.013)
 _TRACK_STEP = 20  # frames, a fifth of a second, between points of the drawn track
 _SHOWN = " ".join(f"{name}.mean {name}.run_to_run published.{name}" for name in ("within_10mm_fraction", "mean", "max"))
-_SCATTERS = 2.0  # a published figure further away than this many standard deviations lies outside the spread
+_SCATTERS = 2.0  # standard deviations beyond which a published value counts as different
 
 
 def cells() -> Sequence[Cell]:
-    """Readings times noise for the thesis's system; for ours, which has no period error, noise and its reading."""
+    """Interpretations times noise for the thesis's system; ours has no period error."""
     nearest, other = PERIOD_ERRORS
     readings = [(True, nearest), (True, 0.0), (False, nearest), (False, 0.0), (True, other)]
     rows = [("thesis", noise, *reading) for reading in readings for noise in _TABLE]
@@ -183,15 +184,15 @@ def cells() -> Sequence[Cell]:
 
 
 def run_job(job: Job) -> JobOutcome:
-    """One simulation run, as the thesis measures it.
+    """One simulation run with the error definitions of the thesis.
 
     Arrays: ``waypoint_m``, distance of each stop from its waypoint; ``track``: t, true x, y, estimated x, y, shape
-    (j, 5); histogram of the distance of true and estimated position, every frame until the last stop.
+    (j, 5); histogram of the distance between true and estimated position in every frame until the last stop.
     """
     found = _Replica(job.cfg, float(job.factors["period_error"])).run()
     track = found.track
     stops = [stop for stop in found.stops if stop.approach == 1]
-    # The way back to base is not part of the thesis's runs.
+    # The drive back to base is not part of the thesis's runs.
     track = track[track[:, 0] <= (stops[-1].t_s if stops else 0.0)]
     error_m = np.hypot(track[:, 1] - track[:, 4], track[:, 2] - track[:, 5])
     waypoint_m = np.array([stop.distance_m for stop in stops])
@@ -223,7 +224,7 @@ def _of_run(errors_m: FloatArray) -> dict[str, float]:
 
 
 def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """Pooled figures, their scatter from run to run, and the published ones beside them."""
+    """Pooled values, their scatter between runs, and the published ones."""
     values = [outcome.values for outcome in outcomes]
     waypoint_m = np.concatenate([outcome.arrays["waypoint_m"] for outcome in outcomes])
     localization = pooled([Histogram.from_arrays(outcome.arrays, "localization") for outcome in outcomes])
@@ -245,10 +246,10 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
 
 
 def _beside(published: Mapping[str, float], runs: Sequence[Mapping[str, float]], published_runs: int) -> dict[str, Any]:
-    """Mean and scatter of single runs for each figure, and how many scatters away the published one lies.
+    """Mean and scatter of single runs for each value, and the difference to the published one in units of scatter.
 
-    The difference of a mean over n runs and one over m scatters by s sqrt(1/n + 1/m). The largest of m > 1 runs is no
-    mean: it is compared with the largest here, by eye.
+    The difference between a mean over n runs and one over m runs has the standard deviation s sqrt(1/n + 1/m). The
+    largest value of m > 1 runs is not a mean, so it is not compared here.
     """
     found: dict[str, Any] = {"published": dict(published), "published_runs": published_runs}
     for name, theirs in published.items():
@@ -273,7 +274,7 @@ def _beside(published: Mapping[str, float], runs: Sequence[Mapping[str, float]],
     return found
 
 
-# -- figures, each after one of the thesis's: 2.9 to 2.12, 3.10 and 3.11 ----------------------------------------------
+# -- figures, each like one of the thesis: 2.9 to 2.12, 3.10 and 3.11 -------------------------------------------------
 
 _NUMBERS = {"normal": ("2.9", "2.10", "3.10"), "twice": ("2.11", "2.12", "3.11")}
 _LIMIT_MM = 1e3 * WITHIN_M
@@ -281,7 +282,7 @@ _BIN_MM = 1.0
 
 
 def draw(results: Sequence[CellResult], out: Path) -> None:
-    """Of both noises: way of the first run, distribution of the localization error, waypoint errors of all runs."""
+    """For both noises: path of the first run, distribution of the localization error, waypoint errors of all runs."""
     for (noise,), mine in grouped(results, "noise").items():
         published, titles = PUBLISHED[noise], [f"{noise} noise, as fig. {number}" for number in _NUMBERS[noise]]
         _draw_localization(mine, published["localization"], titles[1], out / f"localization_{noise}")
