@@ -21,9 +21,9 @@ from ccatp.filters.base import (
     checked_gaussian,
 )
 
-STRONGEST = 1e8
+STRONGEST = 3e3
 """Largest ratio of a row's variance to its noise for an update by subtraction, which loses digits by this factor; so do
-rows that nearly repeat each other. At this limit eight digits remain. Beyond it the update uses a QR factorisation."""
+rows that nearly repeat each other. Beyond it the update uses a QR factorisation."""
 MANY = 32
 """Number of rows beyond which a QR factorisation costs less than one of S."""
 
