@@ -1,12 +1,11 @@
-"""The simulated robot among beacons: its vehicle, what it receives, its true state. Time is an argument.
+"""The simulated robot among beacons: its vehicle, its receivers, its true state. Time is an argument.
 
 Choices the interface leaves open:
 
-* The boot is frame 0 at t = 0, with no reading; a frame ends each step of the world.
-* The robot scans by itself, every so many frames.
-* The wheels obey at once; the link has no delay; there are no fans; the battery stays full.
-* A steering angle turns the robot like wheels of unequal speed, so it needs the permit ``turn``; the echo is that of
-  the wheels.
+* The boot is frame 0 at t = 0, with no reading; each step of the world gives one frame.
+* The robot scans by itself, each time after a number of frames (``observation``).
+* The wheels have no lag; the link has no delay; there are no fans; the battery stays full.
+* A steering angle turns the robot like unequal wheel speeds, so it needs the permit ``turn``.
 """
 
 from math import inf
@@ -25,15 +24,15 @@ from ccatp.sim.motes import MoteListener, TrueMotes, true_motes
 from ccatp.sim.radio import SimDriveCommand, WorldFrame
 from ccatp.sim.radio_world import RadioWorld
 
-_CORNER = (0.0, 0.0)  # a robot without edge sensors has them where it is
-# Streams of random numbers of a seed, apart from those of the world.
+_CORNER = (0.0, 0.0)  # reported place of the edge sensors, which it does not have
+# Streams of random numbers of a seed, different from those of the world.
 _LAYOUT, _RECEIVER = 20, 21
 
 BeaconTruthRow = tuple[int, float, float, float, float, float | None, float | None, float | None]
 
 
 class BeaconRobot(LinkedRobot, TruthSource):
-    """The robot from its boot on; the fans have no effect."""
+    """The simulated robot; fan commands have no effect on its motion."""
 
     truth_rows = 50
 

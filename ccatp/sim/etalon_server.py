@@ -1,14 +1,14 @@
-"""The simulated MultiLine server: the same grammar over simulated lengths, by TCP.
+"""The simulated MultiLine server: the same grammar with simulated lengths, by TCP.
 
-Known limitations (the sources of the grammar are silent on all of them):
+Known limitations (the sources of the grammar do not describe them):
 
-* A line that is no request is answered ``error_unknown-request``, ``error_bad-arguments`` or ``error_bad-channel`` (not
-  1 to 32, or twice); ``measurelengthwithrawdata`` is unknown. The connection stays open.
+* An invalid request is answered ``error_unknown-request``, ``error_bad-arguments`` or ``error_bad-channel`` (not 1 to
+  32, or twice); ``measurelengthwithrawdata`` is unknown. The connection stays open.
 * A channel that is not installed gives a record of length 0 with ``daq_error``.
-* Where the position of the puck cannot be had, each record is of length 0 with ``daq_error`` and the server error is 1.
-* While a client receives the push stream, its own requests but ``stopmeasnogui`` are answered ``error_busy``, and so is
-  another client's ``startmeasnogui``. Other clients' queries are answered, which the real server may refuse: a
-  second client must not be able to stop a survey. The stream runs on the wall clock, a lockstep run or not.
+* If the position of the puck is not available, each record has length 0 and ``daq_error``, and the server error is 1.
+* While a client receives the push stream, all its requests except ``stopmeasnogui`` are answered ``error_busy``, and so
+  is another client's ``startmeasnogui``. Other clients' queries are answered, so that a second client cannot stop a
+  survey; the real server may refuse them. The stream uses the wall clock, also in lockstep.
 * ``stopmeasnogui`` without a stream is answered ``measstopped``.
 * Channel groups, the measurement window, ``defanadata`` and ``measurementfinished`` are not simulated.
 
@@ -38,19 +38,19 @@ _MAX_REPLY_BYTES = 4096
 
 
 class TruthUnavailable(Exception):
-    """The position of the puck could not be had."""
+    """The position of the puck is not available."""
 
 
 class PuckSource(Protocol):
     """Source of the true position of the puck."""
 
     async def puck(self) -> PuckTruth:
-        """The puck now; ``TruthUnavailable`` where it cannot be had."""
+        """The puck now. Raises ``TruthUnavailable``."""
 
 
 @dataclass(slots=True)
 class FixedPuck:
-    """A puck that stands still, world frame; ``step_s`` passes between two queries, for fresh noise."""
+    """A puck at rest, world frame; each query advances the time by ``step_s``, for new noise."""
 
     position_m: Vector3
     t_s: float = 0.0
@@ -58,21 +58,21 @@ class FixedPuck:
     step_s: float = 0.0
 
     async def puck(self) -> PuckTruth:
-        """The puck where it was put."""
+        """The puck at the time of this query."""
         truth = PuckTruth(self.t_s, self.position_m, self.moved_m)
         self.t_s += self.step_s
         return truth
 
 
 class ZmqPuck:
-    """From the simulated robot: request ``b"puck"``, reply ``{"t", "puck": [x, y, z], "moved_m"}``, SI, world."""
+    """Asks the simulated robot: request ``b"puck"``, reply ``{"t", "puck": [x, y, z], "moved_m"}``, SI, world frame."""
 
     def __init__(self, endpoint: str, timeout_s: float = 1.0) -> None:
         self._endpoint, self._timeout_s = endpoint, timeout_s
         self._context = zmq.asyncio.Context()
 
     async def puck(self) -> PuckTruth:
-        """The puck now, by a socket of its own: a REQ socket that lost its reply is stuck."""
+        """The puck now, with a new socket: a REQ socket without its reply takes no further request."""
         try:
             async with asyncio.timeout(self._timeout_s):
                 with self._context.socket(zmq.REQ) as peer:
@@ -101,7 +101,7 @@ _BUSY = Remark("error", "busy")
 class EtalonSimulator:
     """The server of k channels with collimators in the world frame, shape (k, 3).
 
-    ``moved_m`` of ``truth`` is meant over the time in which a length is averaged. ``blocked``, ``flags`` and
+    ``moved_m`` of ``truth`` must refer to the time over which a length is averaged. ``blocked``, ``flags`` and
     ``laser_ready`` of ``model`` may be changed at any time. ``counts``: requests, bad_requests, oversized_lines,
     truth_failures, refused_clients, lost_clients.
     """
@@ -122,13 +122,13 @@ class EtalonSimulator:
         self._end: asyncio.Future[None] | None = None
 
     async def start(self, listener: socket.socket) -> int:
-        """Serve who connects to a bound socket; return its port."""
+        """Serve the clients of a bound socket; return its port."""
         self._end = asyncio.get_running_loop().create_future()
         self._server = await asyncio.start_server(self._accept, sock=listener)
         return int(listener.getsockname()[1])
 
     async def serve(self) -> None:
-        """Wait until closed. An unforeseen error in a session ends it and is raised here."""
+        """Wait until ``close``. Raises an unexpected error of a session."""
         if self._end is None:
             raise RuntimeError("simulated MultiLine server not started: call start first")
         await asyncio.shield(self._end)
@@ -170,7 +170,7 @@ class EtalonSimulator:
             writer.transport.abort()
 
     async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer one client until it ends its side."""
+        """Answer one client until it closes its side."""
         buffer = LineBuffer(multiline.MAX_LINE_BYTES)
         async with asyncio.TaskGroup() as group:
             try:
@@ -228,7 +228,7 @@ class EtalonSimulator:
             await asyncio.sleep(1.0 / self.push_hz)
 
     def _stop_stream(self, writer: asyncio.StreamWriter) -> None:
-        """End the stream: a record is written in one piece, so after this none follows."""
+        """End the stream; a record is written in one piece, so no part of one follows."""
         if self._streaming is writer:
             self._streaming = None
             if self._push is not None:

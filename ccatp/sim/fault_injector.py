@@ -1,16 +1,16 @@
 """Applies a fault plan to the body, to the sensors and to what leaves the robot.
 
 It draws from its own generator, so that a plan never changes what the world and the sensors draw: up to its first fault
-a run with a plan is the run without.
+a run with a plan equals the run without it.
 
-A reading is a tuple of numbers: one, or all components of gravity or of the fans. What "no sample" means depends on the
-list. A wheel without a sample is ``None``, and a row without any is left out. The inertial unit, the edge sensors and
-gravity are read as a whole: without one of its numbers the row is left out. Fans and battery stand in every frame:
-without a new reading the last one is repeated.
+A reading is a tuple of numbers: one, or all components of gravity or of the fans. The effect of "no sample" depends on
+the list. A wheel without a sample is ``None``, and a row without both wheels is removed. In the lists of the inertial
+unit, the edge sensors and gravity the whole row is removed. Fans and battery are in every frame: the last reading, if
+any, is repeated.
 
-The last stage of a frame are its time stamps, its line, and lost, doubled or reordered frames. A line that no client
-may take (a token that is no number, a reading beyond the range of the link) goes out as it is, but counts as not
-delivered: in lockstep no client can answer it, and simulated time must not wait.
+After the sensors, the faults act on the time stamps and the line, then frames are lost, doubled or reordered. An
+invalid line (a token that is not a number, a reading beyond the range of the link) is sent as it is, but counts as not
+delivered: in lockstep no client can answer it, and simulated time must not wait for an answer.
 """
 
 from collections import defaultdict, deque
@@ -34,15 +34,15 @@ Reading = tuple[float, ...]
 Row = tuple[Any, ...]
 """Time and readings; ``None`` is a wheel without a sample."""
 
-# Stand-ins for what cannot be written as a number: no reading has these values, and the line gets the token instead.
+# Numbers that no reading has; in the line each is replaced by its token, which cannot be encoded as a number.
 TOKENS = {"NaN": 1.2345678901234567e201, "Infinity": 1.2345678901234567e202, "1e999": 1.2345678901234567e203}
 _MARKS = [(msgspec.json.encode(mark), token.encode()) for token, mark in TOKENS.items()]
 _BEYOND_DECADES = (3.0, 30.0)  # decades above the range
 _LARGEST_INTEGER = 1_000_000
-# A fault knows readings of so long before it begins: stuck it repeats the last one, late it gives an old one.
+# A sensor fault takes readings from so long before its begin: ``stuck`` repeats the last one, ``delayed`` an old one.
 _MEMORY_S = 60.0
 _ALWAYS = ("fans", "soc")
-_CATCH_UP = 3  # rows that arrive late come this many times as fast as they are taken, so that a line can hold them
+_CATCH_UP = 3  # after the fault, rows that arrive late are sent at this multiple of their rate, to fit into a line
 _LEAST_CATCH_UP = 10
 _BODY_SIGNALS = ("right_wheel", "left_wheel", "right_fan", "left_fan", "body")
 
@@ -50,7 +50,7 @@ _BODY_SIGNALS = ("right_wheel", "left_wheel", "right_fan", "left_fan", "body")
 def _act_on_side(
     fault: Any, k: int, plant: Plant, fans: FanRules, rates: list[float], grip: list[float], health: list[float]
 ) -> bool:
-    """Let a lasting fault act on the right (0) or left (1) wheel or fan; whether that changes anything."""
+    """Apply a lasting fault to the right (0) or left (1) wheel or fan; return whether that changes anything."""
     match fault.type:
         case "blocked":
             is_changed = plant.block(right=k == 0, left=k == 1) or rates[k] != 0.0
@@ -68,7 +68,7 @@ def _act_on_side(
 
 
 class SensorFault:
-    """A fault that changes readings; ``past`` holds the readings that it needs later, with their times."""
+    """A fault that changes readings; ``past`` contains the readings that it needs later, with their times."""
 
     def __init__(self, record: Injected, rng: np.random.Generator) -> None:
         self.record, self.fault = record, record.fault
@@ -81,13 +81,13 @@ class SensorFault:
         self._sees_from_s = self.fault.at_s - _MEMORY_S - self._delay_s
 
     def apply(self, rows: list[Row], now_s: float) -> list[Row]:
-        """The rows as they come out, in the frame of robot time ``now_s``."""
+        """The rows with the fault, in the frame of robot time ``now_s``."""
         if not rows or rows[0][0] >= self.fault.end_s or rows[-1][0] < self._sees_from_s:
             return rows
         return [row for row in map(self._row, rows) if row is not None]
 
     def remember(self, t_s: float, reading: Reading) -> Reading:
-        """Keep a reading, and of those that are old enough only the newest; returns the oldest."""
+        """Store a reading; return the newest one that is at least ``by_s`` old, or else the oldest."""
         past, then_s = self.past, t_s - self._delay_s
         past.append((t_s, reading))
         while len(past) > 1 and past[1][0] <= then_s:
@@ -106,7 +106,7 @@ class SensorFault:
             return row
         found = self._effect(self, t_s, reading)
         if found is not None and not self._is_raw:
-            found = tuple(int(x >= 0.5) for x in found)  # an edge sensor has no value between 0 and 1
+            found = tuple(int(x >= 0.5) for x in found)  # an edge sensor reads only 0 or 1
         self.record.add(t_s, is_changed=found != reading)
         if found is None:
             return self._without(row)
@@ -145,7 +145,7 @@ def _garbage(one: SensorFault, t_s: float, reading: Reading) -> Reading:
         return tuple((sizes * rng.choice((-1.0, 1.0), count)).tolist())
     if signal.is_binary:
         return tuple(rng.integers(0, 2, count).tolist())
-    if signal.rows == "gravity":  # any direction: a vector of another length would not be within the range
+    if signal.rows == "gravity":  # a random direction; only a unit vector is within the range
         direction = rng.standard_normal(count)
         return tuple((direction / sqrt(float(direction @ direction))).tolist())
     return tuple(rng.uniform(signal.low, signal.high, count).tolist())
@@ -153,7 +153,7 @@ def _garbage(one: SensorFault, t_s: float, reading: Reading) -> Reading:
 
 def _wrong(one: SensorFault, t_s: float, reading: Reading) -> Reading:
     fault = one.fault
-    if fault.sign == -1:  # what is 0 or 1 is inverted
+    if fault.sign == -1:  # 0 and 1 are exchanged
         reading = tuple(1.0 - x for x in reading) if one.signal.is_binary else tuple(-x for x in reading)
     factor, offset = 1.0 if fault.factor is None else fault.factor, fault.offset or 0.0
     return tuple(factor * x + offset for x in reading)
@@ -177,14 +177,14 @@ def _saturated(one: SensorFault, t_s: float, reading: Reading) -> Reading:
     return tuple(min(max(x, low), high) for x in reading)
 
 
-# What comes out in place of a reading; ``None``: no sample.
+# Functions that replace a reading; ``None``: no sample.
 EFFECTS: dict[str, Callable[[SensorFault, float, Reading], Reading | None]] = {
     "off": lambda one, t_s, reading: None,
     "stuck": _stuck,
     "garbage": _garbage,
     "wrong": _wrong,
     "slow": _slow,
-    "delayed": SensorFault.remember,  # the reading of ``by_s`` ago; before there is one, the oldest
+    "delayed": SensorFault.remember,  # the reading of ``by_s`` ago, or else the oldest
     "intermittent": _intermittent,
     "saturated": _saturated,
     "non_finite": lambda one, t_s, reading: (TOKENS[one.fault.token],) * len(reading),
@@ -192,7 +192,7 @@ EFFECTS: dict[str, Callable[[SensorFault, float, Reading], Reading | None]] = {
 
 
 class LateRows:
-    """Rows of a signal that arrive late, whole, under the times at which they were taken; they keep their order."""
+    """Delays whole rows of a signal, which keep their own time stamps and their order."""
 
     def __init__(self, record: Injected) -> None:
         self.record, self.signal = record, SIGNALS[record.fault.signal]
@@ -215,7 +215,10 @@ class LateRows:
 
 
 class Injector:
-    """The robot's faults of a plan at work: ``injected``, in the order of the plan; ``drifts`` disturb the plant."""
+    """Applies the robot's faults of a plan. ``injected``: their records, in the order of the plan.
+
+    ``drifts``: disturbances of the plant.
+    """
 
     def __init__(self, plan: FaultPlan, mirror: Mirror, rng: np.random.Generator) -> None:
         self.injected = records = tuple(map(Injected, plan.faults))
@@ -226,7 +229,7 @@ class Injector:
             fault = record.fault
             if fault.signal not in SIGNALS:
                 self._on["body" if fault.signal in _BODY_SIGNALS else fault.signal].append(record)
-            # Fans and battery are reported in every frame and have no time of their own: late they are old readings.
+            # Fans and battery are in every frame, without a time of their own, so a delay gives old readings.
             elif fault.type == "delayed" and fault.stamps == "old" and fault.signal not in _ALWAYS:
                 self._sensing.append(LateRows(record))
             else:
@@ -244,7 +247,7 @@ class Injector:
     def changes(self, t_s: float) -> Iterator[tuple[str, Injected]]:
         """Faults that began or ended since the last call: ``begins`` or ``ended``, and the record.
 
-        A fault of an instant ends as it begins.
+        A fault without ``for_s``, for example a kidnap or a reboot, never ends.
         """
         for record in self.injected:
             if record not in self._begun:
@@ -258,7 +261,7 @@ class Injector:
     def act(
         self, world: World, fans: FanRules, t_s: float, set_points_rad_s: tuple[float, float]
     ) -> tuple[float, float]:
-        """Wheel rates (right, left) of the next step, rad/s; a kidnap moves the world's body, a slip takes its grip."""
+        """Wheel rates (right, left) of the next step, rad/s. Also sets body pose, grip and fan health by the faults."""
         rates, grip, health = [*set_points_rad_s], [1.0, 1.0], [1.0, 1.0]  # right, left
         for record in self._on["body"]:
             fault = record.fault
@@ -277,7 +280,7 @@ class Injector:
         return rates[0], rates[1]
 
     def _drift(self, record: Injected, plant: Plant, t_s: float, dt_s: float, *moved: float) -> BodyStep:
-        """A disturbance of the plant: downhill while the wheels are held at zero."""
+        """A disturbance of the plant: motion downhill while both set points are zero."""
         forward_m, left_m, turn_rad = moved
         right_set, _, left_set, _ = plant.servo
         if right_set or left_set or not record.fault.is_active(t_s):
@@ -291,19 +294,19 @@ class Injector:
         return forward_m + glide_m * ahead, left_m + glide_m * aside, turn_rad
 
     def is_rebooting(self, t_s: float) -> bool:
-        """Whether the robot reboots now; true once for each reboot."""
+        """Whether the robot reboots now; true once for each planned reboot."""
         due = [record for record in self._on["robot"] if record.fault.has_begun(t_s) and not record.samples]
         for record in due:
             record.add(t_s)
         return bool(due)
 
     def reboot(self, seq: int, t_s: float) -> None:
-        """From now on frames count from this one, times from this time."""
+        """Count frames from ``seq`` and times from ``t_s`` from now on."""
         self._seq_0, self._boot_s = seq, t_s
         self._withheld = b""
 
     def sense(self, frame: RobotFrame) -> RobotFrame:
-        """The frame as the robot reads it."""
+        """The frame with the faults of sensors, clock and reported names."""
         t_s, gravity = frame.t, frame.gravity
         rows: dict[str, list[Row]] = {
             "imu": list(frame.imu),
@@ -324,7 +327,7 @@ class Injector:
         return RobotFrame(frame.seq - self._seq_0, stamp, *lists, gravity, (left, right), charge, frame.cmd, names)
 
     def _stamp(self, t_s: float, at_s: float, *, is_frame: bool) -> float:
-        """The time that is written for ``at_s``, counted from the boot, at the time ``t_s`` of the plan."""
+        """The time stamp for ``at_s``, which counts from the boot, at the time ``t_s`` of the plan."""
         for record in self._on["clock"]:
             fault = record.fault
             if not fault.is_active(t_s):
@@ -336,7 +339,7 @@ class Injector:
         return at_s
 
     def _raised(self, t_s: float) -> tuple[str, ...]:
-        """The names that the frame reports, each once."""
+        """The fault names that the frame reports, each once."""
         names: dict[str, None] = {}
         for record in self._on["faults"]:
             if record.fault.is_active(t_s):
@@ -345,7 +348,7 @@ class Injector:
         return tuple(names)
 
     def deliver(self, t_s: float, frame: RobotFrame | None) -> tuple[bytes, Sensors | None]:
-        """What leaves if ``frame`` is due: lines, none or several, and the newest frame that can be read."""
+        """The bytes that leave when ``frame`` is due (no, one or several lines), and its message if it is valid."""
         if frame is None:
             return b"", None
         line = encode(frame)

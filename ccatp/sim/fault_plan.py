@@ -1,7 +1,7 @@
 """Plans of faults for the simulated robot and its link: one model per type, and the types that each signal takes.
 
-The plan is TOML and strict: each mistake is one line with file, line, key and a hint. Keys that may be left out are
-``None`` then; every other value has to be named, as in a configuration.
+The plan is TOML and strict: each mistake gives one line with file, line, key and a hint. Optional keys are ``None`` by
+default; all others are required, as in a configuration.
 """
 
 import json
@@ -25,7 +25,7 @@ _AX_M_S2, _WZ_RAD_S, _WHEEL_RAD_S = 19.6, 34.9, 16.0
 
 
 class Signal(NamedTuple):
-    """Where a signal stands: its rows, its places in a row (the time being place 0), its range."""
+    """Position of a signal in a frame: its list of rows, its columns in a row (column 0 is the time), its range."""
 
     rows: str
     columns: tuple[int, ...]
@@ -59,16 +59,16 @@ class InjectedFault(Model):
 
     @property
     def end_s(self) -> float:
-        """When it ends; infinite without ``for_s``."""
+        """End time; infinite without ``for_s``."""
         for_s = getattr(self, "for_s", None)
         return math.inf if for_s is None else self.at_s + for_s
 
     def is_active(self, t_s: float) -> bool:
-        """Whether it acts at a time."""
+        """Whether the fault is active at ``t_s``."""
         return self.has_begun(t_s) and t_s < self.end_s - _SAME_TIME_S
 
     def has_begun(self, t_s: float) -> bool:
-        """Whether a time is at its beginning or after it."""
+        """Whether ``t_s`` is at or after ``at_s``."""
         return t_s >= self.at_s - _SAME_TIME_S
 
 
@@ -79,7 +79,7 @@ class LastingFault(InjectedFault):
 
 
 class LinkFault(Model):
-    """A fault of the link; it begins at a robot time, or once so much has gone to all clients."""
+    """A fault of the link; it begins at a robot time, or after a number of lines or bytes to all clients together."""
 
     signal: ClassVar[str] = "link"
     type: str
@@ -92,7 +92,7 @@ Direction = Literal["to_client", "to_robot", "both"]
 
 
 class LastingLinkFault(LinkFault):
-    """One that lasts for ``for_s`` of robot time, or until the end, in one direction or both."""
+    """A fault that lasts for ``for_s`` of robot time, or until the end, in one direction or both."""
 
     direction: Direction
     for_s: Positive | None = None
@@ -102,7 +102,7 @@ _Fault = TypeVar("_Fault", InjectedFault, LinkFault)
 
 
 def _types(base: type[_Fault], table: Mapping[str, Mapping[str, Any]]) -> dict[str, type[_Fault]]:
-    """A model for each type of fault; its further keys are required, but for those with a default."""
+    """A model for each type of fault; its further keys are required unless they have a default."""
     models = {}
     for name, keys in table.items():
         fields: dict[str, Any] = {key: kind if isinstance(kind, tuple) else (kind, ...) for key, kind in keys.items()}
@@ -123,39 +123,40 @@ _ON_SENSORS = _types(
     {
         # No samples.
         "off": {},
-        # Always the same reading: ``value``, or the last one before.
+        # Always the same reading: ``value``, or the last one before the fault.
         "stuck": {"value": _NUMBER},
-        # Random readings; the share ``beyond`` of them far beyond the signal's range, the others uniform within it.
+        # Random readings: a share ``beyond`` is far beyond the signal's range, the others are uniform within it.
         "garbage": {"beyond": _Share},
         # ``sign * factor * reading + offset``
         "wrong": {"offset": _NUMBER, "factor": _NUMBER, "sign": (Literal[1, -1] | None, None)},
         # Only every n-th sample.
         "slow": {"every": _SecondOrLater},
-        # Late by ``by_s``: under the sample's time (``fresh``), or arriving late under their own (``old``).
+        # Late by ``by_s``: each sample has the reading of ``by_s`` ago (``fresh``), or arrives late with its own time
+        # stamp (``old``).
         "delayed": {"by_s": Positive, "stamps": Literal["fresh", "old"]},
-        # Sound for the first ``duty`` of each period; then no samples, or the reading ``value``.
+        # Normal for the share ``duty`` of each period; then no samples, or the reading ``value``.
         "intermittent": {"period_s": Positive, "duty": _Share, "value": _NUMBER},
         # Clamped to ``low`` and ``high``.
         "saturated": {"low": _NUMBER, "high": _NUMBER},
-        # The number is replaced in the raw line by a token that is no number of JSON.
+        # The number is replaced in the raw line by a token that is not a finite number of JSON.
         "non_finite": {"token": Literal["NaN", "Infinity", "1e999"]},
     },
 )
-# The wheel stands still, or turns at ``rate_rad_s``, whatever its set point; slip: the body moves by ``factor`` of what
-# the wheels give, of both or of one.
+# The wheel stands still, or turns at ``rate_rad_s``, independent of its set point; slip: the travel that one wheel (or
+# both) gives the body is multiplied by ``factor``.
 _ON_WHEELS = _types(LastingFault, {"blocked": {}, "runaway": {"rate_rad_s": float}, "slip": _SLIP})
-# The fan gives the share ``share`` of its thrust; its echo does not show it.
+# The thrust of the fan is multiplied by ``share``; the duties in the frame do not show it.
 _ON_FANS = _types(LastingFault, {"weak": {"share": _Share}})
 
 TYPES: dict[str, dict[str, type[InjectedFault]]] = {
     **dict.fromkeys(SENSOR_SIGNALS, _ON_SENSORS),
     **dict.fromkeys(("right_wheel", "left_wheel"), _ON_WHEELS),
     **dict.fromkeys(("right_fan", "left_fan"), _ON_FANS),
-    # The body is put elsewhere, relative to where it stands, deck frame; or it glides downhill while the wheels are
-    # held at zero: level ground has no downhill.
+    # The body is moved by an offset, deck frame; or it slides downhill while the set points of the wheels are zero, not
+    # on level ground.
     "body": _types(InjectedFault, {"kidnap": {"dx_m": float, "dy_m": float, "dheading_rad": float}})
     | _types(LastingFault, {"slip": _SLIP, "drift": {"speed_m_s": Positive}}),
-    # All time stamps are off by ``by_s``, which may be negative; or counted modulo ``modulo_s``, as by a counter that
+    # All time stamps have an error of ``by_s``, which may be negative, or are modulo ``modulo_s``, as of a counter that
     # overflows.
     "clock": _types(LastingFault, {"jump": {"by_s": float}, "wrap": {"modulo_s": Positive}}),
     # Every n-th frame is lost, sent twice, or sent after the one that follows it.
@@ -175,45 +176,45 @@ LINK_TYPES: dict[str, type[LinkFault]] = {
     **_types(
         LastingLinkFault,
         {
-            # What is sent disappears, and so does the end of a connection: a half-open connection.
+            # All data and the end of a connection are lost: a half-open connection.
             "black_hole": {},
-            # Nothing is passed on; at the end everything at once.
+            # Nothing is passed on; after the fault everything at once.
             "stall": {},
-            # Everything comes ``delay_s`` late, and up to ``jitter_s`` more, drawn for each piece; the order stays.
+            # Data are late by ``delay_s`` plus up to ``jitter_s``, drawn for each piece; the order stays.
             "delay": {"delay_s": NonNegative, "jitter_s": NonNegative},
             # Every n-th line is passed on after the one that follows it.
             "reorder": {"every": Annotated[int, Field(ge=2)]},
             # Every n-th line is passed on twice.
             "duplicate": {"every": _Nth},
-            # Passed on in writes of so many bytes.
+            # Passed on in writes of at most ``write_bytes`` bytes.
             "fragment": {"write_bytes": _ByteCount},
-            # Further lines at a rate: random ones, or copies of the last line that passed.
+            # Additional lines at ``rate_hz``: random ones, or copies of the last line.
             "flood": {"rate_hz": Positive, "lines": Literal["garbage", "copies"]},
-            # Passed on byte by byte, at a rate.
+            # Passed on byte by byte, at ``bytes_per_s``.
             "slowloris": {"bytes_per_s": Positive},
-            # A line of so many random bytes before every n-th line.
+            # A line of ``garbage_bytes`` random bytes before every n-th line.
             "garbage": {"garbage_bytes": _ByteCount, "every": _Nth},
-            # One byte of every n-th line is another one.
+            # One byte of every n-th line is changed.
             "corrupt": {"every": _Nth},
         },
     ),
 }
 
 LOCKSTEP_TYPES = ("reset", "close", "duplicate", "fragment", "garbage", "corrupt", "reorder", "delay")
-"""What makes sense where simulated time waits for every line: the others would make it wait until they end, which they
-never do."""
+"""Types of link faults that are allowed in lockstep. With the others simulated time would wait for the end of the
+fault, which would never come."""
 
 
 class Injected:
-    """What has become of one fault of the plan so far; robot times."""
+    """Record of when and how often one fault of the plan has acted so far; robot times."""
 
     def __init__(self, fault: Any) -> None:
         self.fault = fault
         self.signal, self.type = str(fault.signal), str(fault.type)
-        self.at_s: float | None = fault.at_s  # when it was to begin; None: it waits for something else
+        self.at_s: float | None = fault.at_s  # planned begin; None: it begins after lines or bytes
         self.from_s: float | None = None  # the first sample, frame or step that it acted on
         self.until_s: float | None = None  # the last one
-        self.samples = self.changed = 0  # how many, and how many of them came out different, or not at all
+        self.samples = self.changed = 0  # how many, and how many of them were changed or removed
 
     def add(self, t_s: float, *, is_changed: bool = True) -> None:
         """Count one sample, frame or step."""
@@ -229,14 +230,14 @@ class Injected:
 
 
 class FaultPlan(NamedTuple):
-    """What shall go wrong in a run; the robot's faults in the order of the file, which is that of their application."""
+    """The faults of a run; the robot's faults are applied in the order of the file."""
 
     faults: tuple[InjectedFault, ...] = ()
     link: tuple[LinkFault, ...] = ()
 
 
 def parse_plan(text: str, name: str) -> FaultPlan:
-    """The plan in a text; a ``ConfigError`` has a line per problem with file, line, key, what is wrong, what to do."""
+    """The plan in a text; a ``ConfigError`` has a line per problem with file, line, key, the problem and a remedy."""
     tree = parse_toml(text, name)
     problems = [
         f"{name}:{find_line(text, (section,))}: {section} is unknown; {choice_hint(section, _SECTIONS)}"
@@ -268,7 +269,7 @@ def read_plan(file: Path, *, lockstep: bool) -> FaultPlan:
 
 
 def check_pacing(plan: FaultPlan, name: str, *, lockstep: bool) -> None:
-    """Refuse faults of the link that make no sense in lockstep, with a ``ConfigError``."""
+    """Raise ``ConfigError`` for link faults that are not in ``LOCKSTEP_TYPES``, in lockstep."""
     problems = [
         f"{name}: link[{k}].type = {format_value(one.type)} makes no sense in lockstep, where simulated time waits for "
         f"every line; add --realtime, or take one of {', '.join(LOCKSTEP_TYPES)}"
@@ -321,7 +322,7 @@ def _validate(model: Any, problems: _Problems, row: Mapping[str, Any]) -> tuple[
     if model is None:
         return None, problems
     try:
-        # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
+        # through JSON, because its strict mode is right for TOML: an array is a tuple, "1" is not a number
         return model.model_validate_json(json.dumps(row, default=str), strict=True), problems
     except ValidationError as error:
         return None, [(format_key(one.key), one.what) for one in faults_of(error.errors(), model)]

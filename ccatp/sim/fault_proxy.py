@@ -1,6 +1,6 @@
-"""A TCP proxy that passes everything on between clients and a server until a fault is switched on.
+"""A TCP proxy that passes all data on between clients and a server until a fault is switched on.
 
-The faults of the link in a fault plan switch it by the robot's clock, and are recorded.
+The link faults of a fault plan are switched on and off by the robot's clock, and recorded.
 """
 
 import asyncio
@@ -16,9 +16,9 @@ from ccatp.sim.fault_plan import Direction, Injected, LinkFault
 
 OneWay = Literal["to_client", "to_robot"]
 OneWayFaults = dict[str, Any]
-"""What is switched on in one direction, one fault of each type."""
+"""The active faults in one direction by type, at most one of each type."""
 
-# While nothing goes out, no more than this is taken in: then the sender feels it.
+# With more unsent bytes than this the proxy stops reading, so that TCP stops the sender.
 MAX_WAITING_BYTES = 8 << 20
 _LF = b"\n"
 _GARBAGE_LINE_BYTES = 64
@@ -30,7 +30,7 @@ _RST_ON_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER: on, for 0 s
 
 
 class LineStage:
-    """Cuts a stream into lines where a fault acts on lines, and applies the faults."""
+    """Cuts a stream into lines while a fault acts on lines, and applies the faults."""
 
     def __init__(self, faults: OneWayFaults, counts: "Counter[str]", rng: random.Random) -> None:
         self._faults, self._counts, self._rng = faults, counts, rng
@@ -39,7 +39,7 @@ class LineStage:
         self._last = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """What goes on when ``data`` came in, in pieces; between two of them a line ends."""
+        """The pieces to pass on after the receipt of ``data``; a line ends between two pieces."""
         if self._faults.keys().isdisjoint(_LINE_FAULTS):
             found, self._rest, self._withheld = self._rest + data + self._withheld, b"", b""
             return [found]
@@ -47,12 +47,12 @@ class LineStage:
         return [piece for line in lines for piece in self._treat(line + _LF)]
 
     def finish(self) -> bytes:
-        """What is left at the end of the stream."""
+        """The remaining bytes at the end of the stream."""
         found, self._rest, self._withheld = self._rest + self._withheld, b"", b""
         return found
 
     def flood_line(self) -> bytes:
-        """One further line."""
+        """One additional line of the fault ``flood``."""
         is_copy = self._faults["flood"].lines == "copies" and self._last
         return self._last if is_copy else self._garbage(_GARBAGE_LINE_BYTES)
 
@@ -76,7 +76,7 @@ class LineStage:
         return found
 
     def _is_hit(self, kind: str) -> bool:
-        """Whether this line is an n-th one; counts it then."""
+        """Count this line for a fault; return whether it is an n-th one, on which the fault acts."""
         fault = self._faults.get(kind)
         if fault is None:
             return False
@@ -90,7 +90,7 @@ class LineStage:
         return self._rng.randbytes(count).replace(_LF, b"\x00") + _LF
 
     def _corrupt(self, line: bytes) -> bytes:
-        """Another byte in one place of the line, which stays one line."""
+        """Change one byte of the line, which stays one line."""
         if line == _LF:
             return line
         at = self._rng.randrange(len(line) - 1)
@@ -99,7 +99,7 @@ class LineStage:
 
 
 class Pipe(asyncio.Protocol):
-    """One end of a connection: what its peer sends goes to the peer of the other end, with the faults of this way."""
+    """One end of a connection: passes data of its peer on to the other end, with the faults of this direction."""
 
     transport: asyncio.Transport
 
@@ -107,7 +107,7 @@ class Pipe(asyncio.Protocol):
         self.way, self.other, self._proxy = way, other, proxy
         self._faults, self._counts, self._rng = proxy.faults[way], proxy.counts, random.Random(proxy.rng.random())
         self._stage = LineStage(self._faults, self._counts, self._rng)
-        self._waiting: deque[tuple[float, bytes]] = deque()  # when it is due, and what
+        self._waiting: deque[tuple[float, bytes]] = deque()  # time when it is due, data
         self._waiting_bytes = 0
         self._due_s = self._next_write_s = 0.0
         self._is_at_end = self._is_shut = self._is_full = self._is_done = False
@@ -119,8 +119,8 @@ class Pipe(asyncio.Protocol):
             other.other = self
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self.transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
-        self.transport.set_write_buffer_limits(0)  # written means: given to the kernel
+        self.transport = cast(asyncio.Transport, transport)  # the type for TCP
+        self.transport.set_write_buffer_limits(0)  # pause until the kernel has all data
         self.transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if self.other is None:
             self.transport.pause_reading()
@@ -137,11 +137,11 @@ class Pipe(asyncio.Protocol):
     def eof_received(self) -> bool:
         self._is_at_end = True
         self.send()
-        return True  # what goes the other way still goes
+        return True  # the other direction stays open
 
     def connection_lost(self, exc: Exception | None) -> None:
         self.eof_received()
-        self.resume_writing()  # what waited for this end has nowhere to go
+        self.resume_writing()  # discard what waits for this end
 
     def pause_writing(self) -> None:
         self._is_full = True
@@ -152,7 +152,7 @@ class Pipe(asyncio.Protocol):
             self.other.send()
 
     def _put(self, data: bytes) -> None:
-        """Let something wait for its time to go out; what is over the limit is lost."""
+        """Queue data until they are due; data over the limit are lost."""
         if not data or self._is_shut or self._waiting_bytes + len(data) > 2 * MAX_WAITING_BYTES:
             return
         late_s = 0.0
@@ -166,7 +166,7 @@ class Pipe(asyncio.Protocol):
             self.transport.pause_reading()
 
     def flood(self, since_s: float | None = None) -> None:
-        """Let further lines wait, after what waits already, at the rate of the fault and while it lasts."""
+        """Queue additional lines at the rate of the fault, while it lasts."""
         now_s, flood = self._loop.time(), self._faults.get("flood")
         if since_s is None and self._flood_timer is not None:
             self._flood_timer.cancel()
@@ -181,7 +181,7 @@ class Pipe(asyncio.Protocol):
         self._flood_timer = self._loop.call_later(_FLOOD_PERIOD_S, self.flood, now_s)
 
     def send(self) -> None:
-        """Give out what is due, or the end; to be called whenever that may have changed."""
+        """Send the data that are due, or the end; call it whenever this may have changed."""
         if self._timer is not None:
             self._timer.cancel()
         other = self.other
@@ -205,7 +205,7 @@ class Pipe(asyncio.Protocol):
             self._timer = self._loop.call_later(max(early_s, 0.0), self.send)
 
     def _write(self, other: "Pipe") -> None:
-        """Write what is due in one piece, or a part of it where the faults want that."""
+        """Write the data that are due in one piece, or a part of them if a fault requires this."""
         now_s, data = self._loop.time(), b""
         while self._waiting and self._waiting[0][0] <= now_s:
             data += self._waiting.popleft()[1]
@@ -240,7 +240,7 @@ class Pipe(asyncio.Protocol):
         self._waiting_bytes = 0
 
     def shut(self) -> None:
-        """Send the end now; nothing goes out any more."""
+        """Discard the queue and send the end now; no data follow."""
         self._forget()
         self._is_shut = True
         if self.other is not None:
@@ -263,17 +263,17 @@ class Pipe(asyncio.Protocol):
 class FaultProxy:
     """A proxy for one server; an asynchronous context manager.
 
-    A fault that lasts acts on the connections that are and on those to come, from ``switch_on`` to ``heal``; ``reset``
-    and ``close`` act at once. ``listener`` is a bound socket; any free port of 127.0.0.1 if not given. ``counts``: what
-    was really done, by the types of the faults: lines hit, writes, bytes swallowed, connections ended; ``connections``
-    taken, ``refused`` because the server could not be reached.
+    A lasting fault acts on present and new connections from ``switch_on`` to ``heal``; ``reset`` and ``close`` act at
+    once. ``listener`` is a bound socket; by default a free port of 127.0.0.1. ``counts``: actual effects, by type of
+    fault: affected lines, writes, lost bytes, ended connections; also accepted ``connections`` and connections
+    ``refused`` because the server could not be reached.
     """
 
     def __init__(self, host: str, port: int, *, seed: int, listener: socket.socket | None = None) -> None:
         self._address, self._listener = (host, port), listener
         self.rng = random.Random(seed)
-        self.faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}  # that are switched on
-        self.connections: list[tuple[Pipe, Pipe]] = []  # both ends of each that there is now
+        self.faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}  # active ones
+        self.connections: list[tuple[Pipe, Pipe]] = []  # both ends of each present connection
         self._tasks: set[asyncio.Task[None]] = set()
         self._reset_after_bytes: int | None = None
         self.port = 0
@@ -302,7 +302,7 @@ class FaultProxy:
         return [pipe for pipes in self.connections for pipe in pipes]
 
     def connect(self, client: Pipe) -> None:
-        """Connect a client that has come to the server."""
+        """Connect a new client to the server."""
         task = asyncio.get_running_loop().create_task(self._connect(client))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -324,11 +324,11 @@ class FaultProxy:
         server.flood()
 
     def forget(self, pipe: Pipe) -> None:
-        """Both ends of a connection have ended."""
+        """Remove a connection of which both ends have ended."""
         self.connections = [pipes for pipes in self.connections if pipe not in pipes]
 
     def pass_on(self, data: bytes, client: asyncio.Transport) -> None:
-        """Write to a client what may go to it, and count it."""
+        """Write to a client and count it; at the limit of ``reset_after`` only up to the limit, then reset."""
         limit = self._reset_after_bytes
         is_last = limit is not None and self.passed_bytes + len(data) >= limit
         if limit is not None and is_last:
@@ -347,20 +347,20 @@ class FaultProxy:
             pipe.reset()
 
     def reset_after(self, passed_bytes: int) -> None:
-        """The same as soon as exactly so many bytes have gone to the clients, counted over all connections."""
+        """Call ``reset`` after exactly so many bytes to the clients, counted over all connections."""
         self._reset_after_bytes = passed_bytes
 
     def close(self) -> None:
-        """End every connection by FIN, on both sides, after what is on its way out of the proxy.
+        """End every connection by FIN, on both sides; data in the queues of the proxy are lost.
 
-        What they still send is read and forgotten: a socket closed over unread bytes sends RST.
+        Later data are read and discarded, because a socket that is closed with unread bytes sends RST.
         """
         self.counts["close"] += len(self.connections)
         for pipe in self._pipes():
             pipe.shut()
 
     def switch_on(self, fault: Any) -> None:
-        """Switch on a fault of a plan, whatever its type."""
+        """Switch on a fault of a plan, of any type."""
         if fault.type in _AT_ONCE:
             (self.reset if fault.type == "reset" else self.close)()
             return
@@ -372,7 +372,7 @@ class FaultProxy:
                 pipe.flood()
 
     def heal(self, direction: Direction = "both", name: str | None = None) -> None:
-        """End every fault that lasts, or that of one type; what was stalled goes in one burst."""
+        """End all lasting faults, or those of one type; stalled data are sent in one burst."""
         for way in _BOTH:
             if direction in {way, "both"}:
                 for kind in [kind for kind in self.faults[way] if name in {None, kind}]:
@@ -382,7 +382,7 @@ class FaultProxy:
 
 
 class LinkFaults:
-    """Faults of the link, ruled by the robot's clock."""
+    """Faults of the link, switched by the robot's clock."""
 
     def __init__(self, plan: tuple[LinkFault, ...], proxy: FaultProxy) -> None:
         self._proxy = proxy
@@ -401,7 +401,7 @@ class LinkFaults:
         return self._records
 
     def changes(self, t_s: float) -> list[tuple[str, Injected]]:
-        """Begin and end what is due at a robot time; what began (``begins``) and ended (``ended``)."""
+        """Begin and end the faults that are due at a robot time; return those that began (``begins``) or ``ended``."""
         news = []
         for record in self._records:
             fault = record.fault
@@ -433,5 +433,5 @@ class LinkFaults:
 
 
 def _is_armed(fault: LinkFault) -> bool:
-    """A reset after so many bytes: the proxy itself waits for the moment, to the byte."""
+    """Whether it is a reset after so many bytes, which the proxy itself does at the exact byte."""
     return fault.type == "reset" and fault.after_bytes is not None

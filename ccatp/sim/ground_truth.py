@@ -1,4 +1,4 @@
-"""The true state of a simulation beside the robot link: published by ZeroMQ, and kept in a file."""
+"""The true state of a simulation, separate from the robot link: published by ZeroMQ and stored in a file."""
 
 import os
 import zlib
@@ -24,11 +24,11 @@ MAX_REQUEST_BYTES = 4096
 class TruthSource(ABC):
     """The true state of a simulated robot."""
 
-    truth_rows = 100  # a batch of the log of the true state
+    truth_rows = 100  # rows of one message
 
     @property
     def truth_requests(self) -> Mapping[str, Callable[[], dict[str, object]]]:
-        """Replies for the true state, by request."""
+        """Functions that give the reply, by request."""
         return {}
 
     @abstractmethod
@@ -41,11 +41,11 @@ class TruthSource(ABC):
 
     @abstractmethod
     def truth_preface(self) -> tuple[str, Message]:
-        """What a recorder needs before the first rows, likewise."""
+        """Topic and message that a recorder needs before the first rows."""
 
     @property
     def is_fallen(self) -> bool:
-        """Whether the robot fell; its row is published at once."""
+        """Whether the robot has fallen; the row of its fall is published at once."""
         return False
 
     def describe_fall(self) -> dict[str, object]:
@@ -90,10 +90,10 @@ class SurveyTruth(TruthSource):
 
 
 class GroundTruthPublisher:
-    """Collects a row of the true state per frame, publishes it at ``pub`` and answers requests at ``rep``, where given.
+    """Collects a row of the true state per frame, publishes them at ``pub`` and answers requests at ``rep``, if given.
 
-    Requests are answered as JSON: those of the robot, and ``b"flush"``: ``{"rows": n}``, the number of rows published
-    so far, after the pending ones; anything else: ``{"error"}``.
+    Replies are JSON. Requests are ``truth_requests`` of the robot and ``b"flush"``, which publishes the pending rows
+    and replies ``{"rows": n}``, the number of rows so far. The reply to any other request is ``{"error": text}``.
     """
 
     def __init__(self, robot: TruthSource, rep: str | None = None, pub: str | None = None) -> None:
@@ -111,7 +111,7 @@ class GroundTruthPublisher:
         self.add()
 
     def add(self) -> None:
-        """Take the row of the newest frame; a batch is published when it is full, or the robot fell."""
+        """Take the row of the newest frame; publish when there are ``truth_rows`` rows or the robot has just fallen."""
         robot = self._robot
         self._rows.append(robot.truth_row())
         has_fallen, self._was_fallen = robot.is_fallen is not self._was_fallen, robot.is_fallen
@@ -124,7 +124,7 @@ class GroundTruthPublisher:
         self._taken += len(rows)
         if not rows or self._publisher is None:
             return
-        if not self._has_sent_preface:  # before the first batch: a recorder of one has the other, however the run ends
+        if not self._has_sent_preface:  # a recorder that has rows then has the preface, too, however the run ends
             self._has_sent_preface = True
             self._publisher.send(*self._robot.truth_preface())
         self._publisher.send(*self._robot.truth_message(rows))
@@ -143,7 +143,7 @@ class GroundTruthPublisher:
         return msgspec.json.encode(reply)
 
     async def serve(self) -> None:
-        """Answer requests for ever."""
+        """Answer requests until cancelled."""
         while self._rep is not None:
             await self._rep.send(self.answer(await self._rep.recv()))
 
@@ -162,16 +162,16 @@ _POSE, _CRC = Struct("<3d"), Struct("<I")
 
 
 class SimPoseFile:
-    """Keeps the true pose, ten times a second of simulated time; a real robot stays where it is when its host dies.
+    """Stores the true pose every ``PERIOD_FRAMES`` frames, so that the next run can start where this one ended.
 
-    The file is made with the first pose.
+    A real robot, too, stays where it is when its computer stops. The file is created with the first pose.
     """
 
     def __init__(self, path: Path) -> None:
         self._path, self._fd = path, -1
 
     def read(self) -> DeckPose | None:
-        """The pose that was kept last, deck frame; ``None`` without a sound one."""
+        """The last stored pose, deck frame; ``None`` if there is none or its checksum is wrong."""
         try:
             data = self._path.read_bytes()
         except OSError:
@@ -182,7 +182,7 @@ class SimPoseFile:
         return DeckPose(*_POSE.unpack(body))
 
     def keep(self, seq: int, plant: Plant) -> None:
-        """Frame ``seq`` has been driven."""
+        """Store the pose after frame ``seq`` if ``seq`` is a multiple of ``PERIOD_FRAMES``."""
         if seq % PERIOD_FRAMES:
             return
         if self._fd < 0:

@@ -1,13 +1,13 @@
 """Simulated hardware of the on-board program: geared DC motors that turn the wheels of the plant, counters, voltages.
 
-A geared DC motor at a voltage V goes to the speed of its steady state, with the time constant of its mechanics:
+A geared DC motor at a voltage V approaches its steady speed with its mechanical time constant:
 
     w_end = (V - V_friction - V_load) / ke,   T = J R / (kt ke)
 
-kt, ke: torque per ampere and voltage per rad/s at the wheel, R: resistance, J: inertia at the wheel with half of the
-robot's mass, V_friction: voltage of the Coulomb friction, V_load: that of half of gravity's part along the robot. The
-plant's first-order wheels are such a motor exactly while the voltage is constant, so the plant steps once for each step
-of the control loop. A braked motor is one at 0 V.
+kt, ke: torque per ampere and voltage per rad/s at the wheel, R: resistance, J: inertia of half of the robot's mass at
+the wheel, V_friction: voltage of the Coulomb friction, V_load: voltage of the load, half of gravity's component along
+the robot. The plant's first-order wheels represent this motor exactly while the voltage is constant, so the plant makes
+one step for each step of the control loop. A braked motor has 0 V.
 """
 
 from collections.abc import Sequence
@@ -29,16 +29,16 @@ _EPSILON_S = 1e-9
 
 
 class Motor(NamedTuple):
-    """A geared DC motor, at the wheel."""
+    """A geared DC motor; its values are those at the wheel."""
 
-    volt: float  # of the two figures that follow
+    volt: float  # voltage of the two following values
     no_load_rad_s: float
     stall_nm: float
     friction_nm: float
 
     @property
     def volt_per_rad_s(self) -> float:
-        """Slope of the steady state: what the figure without load leaves after friction."""
+        """Slope ke of the steady state: (voltage - friction voltage) / speed without load."""
         return (self.volt - self.friction_nm * self.volt_per_nm) / self.no_load_rad_s
 
     @property
@@ -59,22 +59,22 @@ class Motor(NamedTuple):
         return inertia_kg_m2 * self.volt_per_nm / self.volt_per_rad_s
 
 
-# At a gear of 75.81 : 1 the maker gives, at 12 V, 450 rev/min without load, 1.0 kgf cm at stall, and 0.08 A of 0.75 A
-# without load, which is the friction; here all of it at 297.92 : 1. The speed that a slope gives to a braked wheel is
-# in proportion to the load over the torque at stall, so a weaker gear would not hold the robot.
+# Data of the maker for a gear of 75.81 : 1 at 12 V: 450 rev/min without load, 1.0 kgf cm at stall, 0.08 A without load
+# and 0.75 A at stall (their ratio gives the friction). They are converted to 297.92 : 1. The speed of a braked wheel on
+# a slope increases with load torque / stall torque, so a lower gear ratio would not hold the robot.
 _GEAR = 297.92 / 75.81
 MOTOR_12V = Motor(volt=12.0, no_load_rad_s=47.1 / _GEAR, stall_nm=0.0981 * _GEAR, friction_nm=0.0105 * _GEAR)
 
 
 class SimulatedHardware:
-    """The devices of a simulated robot; ``read`` moves the world on to its time.
+    """The devices of a simulated robot; ``read`` advances the world to its time.
 
-    ``rng`` is the parent of the random draws; with ``is_lifted`` the wheels turn freely. ``faults`` may be filled by a
-    test: they are reported as they are.
+    ``rng`` is the parent of the generators; with ``is_lifted`` the wheels turn freely. A test may set ``faults``, which
+    are reported unchanged.
 
     Attributes:
         world: the truth.
-        voltages_v: of the (right, left) motor in force.
+        voltages_v: present voltages of the (right, left) motor.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class SimulatedHardware:
         self.timer_calls = 0
 
     def _make_world(self, cfg: Config, rng: np.random.Generator, start: DeckPose | None) -> World:
-        """The truth, stepped at the rate of the loop."""
+        """The truth, with one step per step of the control loop."""
         window = max(1, round(cfg.etalon.measuring_time_s * self._loop_hz))
         return World(cfg, self._mirror, rng, window, start=start)
 

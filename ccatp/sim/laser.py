@@ -1,7 +1,7 @@
 """The simulated laser metrology: lengths with noise, error flags, motion tolerance.
 
-The noise of a length is a function of (seed, time of the puck, channel) alone, not of the requests that went before: a
-second client, a repeated request or another order of channels never changes what a survey reads.
+The noise of a length is a function of (seed, time of the puck, channel) alone, not of earlier requests: a second
+client, a repeated request or another order of channels never changes the lengths of a survey.
 """
 
 import math
@@ -14,7 +14,7 @@ from ccatp.config.models import SimEtalonConfig
 from ccatp.core import FloatArray, Vector3
 from ccatp.links.multiline import FLAGS, ChannelRecord, Environment
 
-# Air on a high site. Lengths are already corrected for refraction, so it takes no part in them.
+# Air on a high site. Lengths are already corrected for refraction, so they do not depend on it.
 AIR = Environment(temperature_c=-5.0, pressure_hpa=525.0, humidity_pct=30.0)
 
 _INTENSITY = (400, 2000)  # least and largest counts of a good return; arbitrary units
@@ -25,7 +25,7 @@ SEED_STREAM = 2
 
 
 class PuckTruth(msgspec.Struct, frozen=True, rename={"t_s": "t", "position_m": "puck"}):
-    """Centre of the puck, world frame, and the furthest it was from there within the last measuring time."""
+    """Centre of the puck, world frame, and its largest distance from there within the last measuring time."""
 
     t_s: float
     position_m: Vector3
@@ -33,9 +33,9 @@ class PuckTruth(msgspec.Struct, frozen=True, rename={"t_s": "t", "position_m": "
 
 
 class EtalonModel:
-    """Channels that look at the puck from known collimators, world frame, shape (k, 3); ``rng`` is drawn from once.
+    """Channels that measure the puck from known collimators, world frame, shape (k, 3); ``rng`` is drawn from once.
 
-    ``ValueError``: channels and collimators do not fit.
+    Raises ``ValueError`` if the numbers of channels and collimators differ.
     """
 
     def __init__(
@@ -58,12 +58,12 @@ class EtalonModel:
         return tuple(self._collimators)
 
     def records(self, channels: Sequence[int], puck: PuckTruth | None) -> tuple[ChannelRecord, ...]:
-        """One record per asked channel, in the order asked.
+        """One record per requested channel, in the order of the request.
 
         The length is |puck - collimator| plus noise of sigma = length_sigma_m + length_sigma_per_m * length. A channel
         that is not installed gives ``daq_error`` and the length 0, a blocked one ``beam_break`` and the length 0, a
-        puck that moved further than the tolerance ``motion_tolerance_error``. Where the puck is not known each record
-        is that of a channel that is not installed.
+        puck that moved further than the tolerance ``motion_tolerance_error``. Without ``puck`` each record is that of a
+        channel that is not installed.
         """
         return tuple(self._record(channel, puck) for channel in channels)
 
@@ -83,8 +83,9 @@ class EtalonModel:
         return self._format(channel, length_m + sigma_m * self._noise(puck.t_s, channel), flags)
 
     def _noise(self, t_s: float, channel: int) -> float:
-        """Standard normal number that belongs to this channel at this time (to the microsecond)."""
-        # A counter-based generator: the key names the stream, the counter (its low words count draws) the time.
+        """Standard normal number, a function of this channel and this time (rounded to a microsecond)."""
+        # A counter-based generator: the key selects the stream, a high word of the counter the time; the low words
+        # count the draws.
         counter = np.array([0, 0, round(t_s * 1e6) & _WORD, 0], dtype=np.uint64)
         key = np.array([self._key, channel], dtype=np.uint64)
         return float(np.random.Generator(np.random.Philox(counter=counter, key=key)).standard_normal())

@@ -1,7 +1,7 @@
-"""The motes of a simulated field: where they are, which pulses they receive, and what the robot's listener receives.
+"""The motes of a simulated field: their positions, the pulses they receive, and what the robot's listener receives.
 
 A pulse has a usable region, a time of flight, echoes, losses and a temperature. The motes send one after the other,
-round by round; each receiver receives a pulse at once. Reports are not lost.
+round by round; a pulse is received in the frame in which it is sent. Reports are not lost.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from ccatp.sim.radio import TruePose
 
 @dataclass(frozen=True, slots=True)
 class TrueMotes:
-    """Positions and unit vectors of facing, shape (n, d); a facing is zero where a mote is turned to its peer."""
+    """Positions and unit vectors of facing, shape (n, d); a facing of zero: the mote always faces its peer."""
 
     names: tuple[str, ...]
     positions_m: FloatArray
@@ -27,7 +27,7 @@ class TrueMotes:
 
 
 def true_motes(cfg: CricketConfig, rng: np.random.Generator) -> TrueMotes:
-    """The motes of a configuration; ``rng`` draws the places of ``random``."""
+    """The motes of a configuration; ``rng`` draws the positions of the layout ``random``."""
     if cfg.layout == "networks":
         return _stands(cfg)
     if cfg.layout == "motes":
@@ -60,7 +60,7 @@ _ABSOLUTE_ZERO_C = -273.15
 
 
 class MotePulse(NamedTuple):
-    """Readings of one pair: delays of pulse after message, shape (k,); as many as were received."""
+    """Readings of one pair: delays of pulse after message, shape (k,), with k received pulses."""
 
     transmitter: int
     listener: int
@@ -69,7 +69,7 @@ class MotePulse(NamedTuple):
 
 
 class MoteField:
-    """Motes that range among themselves; ``rng`` draws the errors of the thermometers, once for each mote."""
+    """Motes that range to each other; ``rng`` draws the errors of the thermometers, once for each mote."""
 
     def __init__(self, cfg: CricketConfig, motes: TrueMotes, rng: np.random.Generator) -> None:
         self.motes = motes
@@ -80,7 +80,7 @@ class MoteField:
         self._sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
 
     def receives(self, transmitter: int, listener: int) -> bool:
-        """Whether a mote is in the usable region of another, and the other in its own."""
+        """Whether the distance of two motes is within the usable range of their transducers and directions."""
         places, facings = self.motes.positions_m, self.motes.facings
         way = places[listener] - places[transmitter]
         distance_m = float(np.linalg.norm(way))
@@ -110,17 +110,17 @@ class MoteField:
         return np.asarray(delays_s[rng.random(repeats) >= true.loss_probability])
 
     def delays_s(self, ways_m: FloatArray) -> FloatArray:
-        """How long after its message each pulse is detected that takes such a way, by the listener's clock."""
+        """Delay of each pulse after its message, for path lengths ``ways_m``, rounded to the listener's clock."""
         true = self._cfg.sim
         delays_s = np.maximum(ways_m / self._sound_m_s + true.latency_s, 0.0)
         return np.asarray(np.round(delays_s / true.tick_s) * true.tick_s if true.tick_s > 0.0 else delays_s)
 
 
 def usable_reach(transducer: TransducerConfig, off_transmitter_rad: float, off_listener_rad: float) -> float:
-    """How far a pulse is received, m: reach(a) reach(b) / reach(0), with angles a and b between axes and way.
+    """Largest distance of reception, m: reach(a) reach(b) / reach(0), with the angles a and b between axes and path.
 
-    Both transducers have the same directivity, and each takes its share of the reach on the axis. Between the angles of
-    the table the reach is linear, beyond them 0.
+    Both transducers have the same directivity: each multiplies the reach on the axis by reach(angle) / reach(0).
+    Between the angles of the table the reach is linear, beyond them 0.
     """
     on_axis_m = transducer.reach_m[0]
     if transducer.is_omnidirectional or on_axis_m <= 0.0:
@@ -130,18 +130,18 @@ def usable_reach(transducer: TransducerConfig, off_transmitter_rad: float, off_l
 
 
 def _off_axis(facing: FloatArray, way: FloatArray) -> float:
-    """Angle between an axis and a way; nought for a mote that is turned to the other."""
+    """Angle between an axis and a path, rad; 0 for a mote that faces its peer."""
     length = float(np.linalg.norm(way))
     if not facing.any() or length <= 0.0:
         return 0.0
     return float(np.arccos(np.clip(facing @ way / length, -1.0, 1.0)))
 
 
-_DIGITS = 9  # of a delay on the link: a nanosecond is a third of a micrometre
+_DIGITS = 9  # decimals of a delay, s, on the link: sound travels a third of a micrometre in a nanosecond
 
 
 class MoteListener:
-    """The listener on the robot, frame by frame; its configuration has its name and how many motes send in a frame."""
+    """The listener on the robot; its configuration has its name and the number of motes that send in a frame."""
 
     def __init__(
         self, cfg: CricketConfig, listener: ListenerConfig, motes: TrueMotes, rng: np.random.Generator
@@ -152,7 +152,7 @@ class MoteListener:
         self._sent = 0
 
     def receive(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
-        """Pulses of the frame that ends now."""
+        """Pulses of the frame that ends at ``time_s``."""
         count = len(self._motes.names)
         received: list[MoteBurst] = []
         for _ in range(self._listener.pulses_per_frame):
@@ -174,11 +174,11 @@ class MoteListener:
         return bursts
 
     def _own(self, time_s: float, pose: TruePose, sender: int) -> list[MoteBurst]:
-        """The robot's listener receives all round; the mote has its cone."""
+        """The pulse at the robot's listener, which is omnidirectional; the mote is directional."""
         true, rng, cfg = self._cfg.sim, self._rng, self._cfg
         way = np.array((pose.x_m, pose.y_m)) - self._motes.positions_m[sender, :2]
         way_m = hypot(*way)
-        # Drawn whatever becomes of it, so that one pulse more or less does not change all that follow.
+        # Always drawn, so that a pulse that is not received does not change the numbers of the following ones.
         noise, echo_m, is_echo, is_lost = rng.normal(), rng.exponential(), rng.random(), rng.random()
         reach_m = usable_reach(cfg.transducer, _off_axis(self._motes.facings[sender, :2], way), 0.0)
         if not cfg.transducer.nearest_m <= way_m <= reach_m or is_lost < true.loss_probability:

@@ -1,12 +1,13 @@
 """The robot as a rigid body on the mirror, with tyres, motors and fans: MuJoCo, an optional package.
 
-Deck frame, SI. A body of 1 kg stands on two driven wheels and a smooth caster behind them, on the tangent plane of the
-mirror, which follows it: at the wheels the mirror departs from it by 65 um. Contacts have Coulomb friction (elliptic
-cone); the tyres are round (they touch in a point) or flat. Each wheel has the geared DC motor of
-``ccatp.sim.hardware``: torque kt (V - ke w)/R less friction. The fans press along the robot's own normal. Gravity is
-that of the mirror's inclination. Nothing is random: a run depends on its commands alone, besides what the sensors draw.
+Deck frame, SI. A body of ``sim.physics.mass_kg`` stands on two driven wheels and a smooth caster behind them. The
+ground is the tangent plane of the mirror at the robot, renewed in each step; at the wheels the mirror differs from it
+by 65 um. Contacts have Coulomb friction (elliptic cone); the tyres are round (point contact) or flat. Each wheel has
+the geared DC motor of ``ccatp.sim.hardware``: torque kt (V - ke w)/R minus friction. The thrust of the fans is along
+the robot's own normal. Gravity is that of the mirror's inclination. The motion depends on the start and the commands
+alone, without random numbers.
 
-Slip, creep, load and loss of grip come out of the contacts, so the disturbances of the kinematic worlds are not used.
+Slip, creep, load and loss of grip result from the contacts, so the disturbances of the kinematic worlds are not used.
 """
 
 from math import atan2
@@ -23,8 +24,8 @@ from ccatp.sim.plant import Plant
 from ccatp.sim.world import World
 
 _TYRE_M = 0.012  # width of a flat tyre
-_TYRE_PRIORITY = 2  # of contacts: the tyre's friction counts, not the mirror's
-_AVERAGED = 5  # steps: what the inertial unit takes the mean of
+_TYRE_PRIORITY = 2  # of contacts: the tyre's friction is used, not the mirror's
+_AVERAGED = 5  # steps over which the accelerations are averaged
 
 _MODEL = """
 <mujoco model="survey robot">
@@ -61,15 +62,15 @@ _FLAT = (
 
 
 class PhysicsPlant(Plant):
-    """The body; ``step`` takes motor voltages in the place of set points.
+    """The body; ``step`` takes motor voltages instead of set points.
 
     Attributes:
         thrust_n: of the fans, along the robot's normal, towards the surface.
-        has_left: it no longer touches the mirror.
+        has_left: its origin is more than 0.03 m above the mirror.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, start: DeckPose, motor: Motor, step_s: float) -> None:
-        """``step_s``: of the control loop, and of the physics."""
+        """``step_s``: step of the control loop and of the physics."""
         robot = cfg.robot
         super().__init__(
             mirror.surface, start, wheel_radius_m=robot.wheel_radius_m, wheel_base_m=robot.wheel_base_m, wheel_lag_s=1.0
@@ -131,11 +132,11 @@ class PhysicsPlant(Plant):
             dx * self.lx + dy * self.ly,
             (self.heading_rad - heading_rad),
         )
-        # Rest is never exact: what is below a micrometre a step is none to the edge sensors, until it adds up.
+        # Rest is never exact, so the body always counts as moving; the edge sensors add up the small displacements.
         self.is_moving = True
 
     def _lay_ground(self) -> None:
-        """The tangent plane under the robot; a plane that the model has at its origin could not be moved."""
+        """Move the ground to the tangent plane under the robot (impossible for a plane at the model's origin)."""
         self._model.geom_pos[0] = self.x_m, self.y_m, self.z_m
         axes = np.array(self._surface.axes(self.x_m, self.y_m)).T
         self._mujoco.mju_mat2Quat(self._model.geom_quat[0], axes.ravel())
@@ -175,7 +176,7 @@ class PhysicsPlant(Plant):
         return self._rate_rad_s
 
     def place(self, x_m: float, y_m: float, heading_rad: float) -> None:
-        """Put the body, at rest, elsewhere on the surface, deck frame."""
+        """Set the pose of the body on the surface, deck frame, at rest."""
         axes = np.array(self._mirror.robot_axes(DeckPose(x_m, y_m, heading_rad))).T
         data = self._data
         data.qpos[:3] = self._surface.point(x_m, y_m)
@@ -186,13 +187,13 @@ class PhysicsPlant(Plant):
         self._read_state()
 
     def set_friction(self, friction: float) -> None:
-        """Of both tyres, from now on."""
+        """Set the friction coefficient of both tyres."""
         for geom in range(self._model.ngeom):
             if self._model.geom_priority[geom] == _TYRE_PRIORITY:
                 self._model.geom_friction[geom, 0] = friction
 
     def stop_dead(self) -> None:
-        """Nothing moves any more (the robot fell)."""
+        """Stop body and wheels (the robot fell)."""
         self._data.qvel[:] = 0.0
         super().stop_dead()
 

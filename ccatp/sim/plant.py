@@ -1,4 +1,4 @@
-"""Truth of the differential drive on the curved surface, deck frame, what disturbs it, and the world's random numbers.
+"""Truth of the differential drive on the curved surface, deck frame; its disturbances; the world's random numbers.
 
 The wheel servos are first order, ``T dw/dt + w = u`` with the set point u constant within a step, so rates, wheel
 travel and acceleration are exact at every instant of it. The body moves by one midpoint step on the surface metric;
@@ -6,14 +6,15 @@ its error per 10 ms step at 0.2 m/s and 1 rad/s is below 10 nm.
 
 Choices of the disturbances (true wheel measures, slip, downhill creep, vibration):
 
-* Each wheel has a radius error of its own; the base and the lag have one each. The robot announces nominal values.
+* Each wheel has its own radius error; base and lag have one error each. The robot reports nominal values.
 * Slip is lost travel, ``body = (1 - s) wheel``, per wheel: a uniform part drawn for each leg and an
   Ornstein-Uhlenbeck part. A leg begins when the wheels get a set point after ``LEG_PAUSE_S`` of zero set points, so
   the turn and the drive that lead to one stop share their slip.
-* Creep goes along gravity's part in the tangent plane with a share of the forward speed that the wheels give; its
-  change is too slow for the accelerometer, which does not see it.
-* Vibration while the fans thrust is jitter of place and heading, white from frame to frame and of constant size: its
-  rates are differences, so their sum never grows. What the accelerometer reads of it is a difference, too.
+* Creep is along gravity's component in the tangent plane, with a share of the forward speed that the wheels give. It
+  changes slowly, so the accelerometer does not measure it.
+* Vibration while the fans thrust is jitter of position and heading, white noise from frame to frame. Its rates are
+  differences of this noise, so their sum is bounded. The acceleration that it adds to the readings is a difference,
+  too.
 
 Each kind of random number has its own stream, a function of the seed alone.
 """
@@ -31,24 +32,24 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import Surface, SurfacePatch
 
 WHOLE = 1.5 * 2.0**52
-"""``x + WHOLE - WHOLE`` is ``x`` rounded to a whole number while ``|x| < 2**51``: no call, no integer in between."""
+"""``x + WHOLE - WHOLE`` is ``x`` rounded to a whole number while ``|x| < 2**51``, without a call."""
 BLOCK = 4096
-"""Numbers drawn at a time: plain floats from a list are cheaper than calls to the generator."""
+"""Numbers drawn at a time: floats from a list are faster than calls of the generator."""
 LEG_PAUSE_S = 0.2
 LEVEL_SLOPE = 1e-3  # downhill has no direction where the surface is level
 _SAME_STEP_S = 1e-9  # differences of frame times are equal to within rounding
 _SAME_TIME_S = 1e-6
-# A wheel this slow stands still: the exponential of the servo would never get there, and 1e-9 rad/s is 1 um in 9 h.
+# A wheel slower than this is set to rest, which the exponential of the servo never reaches; 1e-9 rad/s is 1 um in 9 h.
 _STANDSTILL_RAD_S = 1e-9
-_REACH_M = 5e-3  # of one expansion of the surface: its error turns the heading by less than 1e-9 rad on a metre's way
+_REACH_M = 5e-3  # of one expansion of the surface: the error of the heading is below 1e-9 rad per metre
 
 BodyStep = tuple[float, float, float]
 """Displacement along robot x and y, m, and rotation about robot z, rad."""
 
 
 Disturbance = Callable[["Plant", float, float, float, float, float], BodyStep]
-"""What pushes the body besides its wheels: from the plant, time and length of the step (s), and the body's displacement
-before this disturbance, it gives the displacement after it."""
+"""Moves the body besides its wheels: from the plant, time and length of the step (s), and the body's displacement
+without this disturbance, it returns the displacement with it."""
 
 
 class Plant:
@@ -105,7 +106,7 @@ class Plant:
             self._move(forward, sideways, turn)
 
     def _turn_wheels(self, dt_s: float) -> BodyStep:
-        """Turn the wheels for a step; what the body would move by them alone."""
+        """Turn the wheels for a step; return the displacement of the body by the wheels alone."""
         if dt_s != self._decay_dt_s:
             self._decay_dt_s, self._decay = dt_s, exp(-dt_s / self.lag_s)
         decay, right_set, left_set = self._decay, self._right_set, self._left_set
@@ -126,8 +127,8 @@ class Plant:
         return half_radius_m * (right_rad + left_rad), 0.0, half_radius_m * (right_rad - left_rad) / self._half_base_m
 
     def _move(self, forward_m: float, left_m: float, turn_rad: float) -> None:
-        # Where the middle of the step will be, from the axes at its start: good to second order, which is all a
-        # derivative of the surface there needs.
+        # The middle of the step, from the axes at its start: the error is of second order, which suffices for the
+        # derivatives of the surface there.
         x, y = self.x_m, self.y_m
         mx = x + 0.5 * (forward_m * self.hx + left_m * self.lx)
         my = y + 0.5 * (forward_m * self.hy + left_m * self.ly)
@@ -185,18 +186,18 @@ class Plant:
         return 0.5 * self._radius_m * difference / self._half_base_m + self.shake_rate_rad_s
 
     def lateral_acceleration_at(self, decay: float) -> float:
-        """Acceleration along robot y within the last step, m/s^2: the body rolls as its wheels turn."""
+        """Acceleration along robot y within the last step, m/s^2: turn rate times forward speed, without slip."""
         speed_m_s = 0.5 * self._radius_m * (self.right_rad_s + self.left_rad_s)
         return self.turn_rate_at(decay) * speed_m_s
 
     def place(self, x_m: float, y_m: float, heading_rad: float) -> None:
-        """Put the body elsewhere on the surface, deck frame; the wheels do not turn."""
+        """Set the pose of the body, deck frame, on the surface; the wheels do not turn."""
         self.x_m, self.y_m, self.heading_rad = x_m, y_m, heading_rad
         self.z_m, self.fx, self.fy, *_ = self._jet(x_m, y_m)
         self._turn_axes()
 
     def block(self, *, right: bool, left: bool) -> bool:
-        """Stop wheels at once; whether any of them turned."""
+        """Stop wheels at once; return whether any of them turned."""
         was = bool((right and self.right_rad_s) or (left and self.left_rad_s))
         self.right_rad_s = 0.0 if right else self.right_rad_s
         self.left_rad_s = 0.0 if left else self.left_rad_s
@@ -211,16 +212,16 @@ class Plant:
 
 
 def noise_stream(rng: np.random.Generator, sigma: float = 1.0) -> Iterator[float]:
-    """Normal numbers of one kind without end, of standard deviation ``sigma``: a function of the seed only."""
+    """Infinite stream of normal numbers of standard deviation ``sigma``: a function of the seed only."""
     blocks: Iterator[list[float]] = iter(lambda: rng.normal(0.0, sigma, BLOCK).tolist(), None)
     return chain.from_iterable(blocks)
 
 
 class OrnsteinUhlenbeck:
-    """Stationary process with ``cov(x(t), x(t+d)) = sigma^2 exp(-d/T)``, exact at whatever times it is asked for.
+    """Stationary process with ``cov(x(t), x(t+d)) = sigma^2 exp(-d/T)``, exact at any times.
 
-    ``x(t+d) = a x(t) + sigma sqrt(1 - a^2) n`` with ``a = exp(-d/T)``; the first value, at t = 0, is one of the
-    stationary distribution. ``time_s`` is the correlation time T. A time without a request costs nothing.
+    ``x(t+d) = a x(t) + sigma sqrt(1 - a^2) n`` with ``a = exp(-d/T)``; the first value, at t = 0, is drawn from the
+    stationary distribution. ``time_s`` is the correlation time T. The steps d may have any length.
     """
 
     def __init__(self, sigma: float, time_s: float, rng: np.random.Generator) -> None:
@@ -231,7 +232,7 @@ class OrnsteinUhlenbeck:
         self._step_s, self._keep, self._kick = 0.0, 1.0, 0.0
 
     def at(self, t_s: float) -> float:
-        """The value at ``t_s``, which is not before the time asked for last."""
+        """The value at ``t_s``, which must not be before the last ``t_s``."""
         step_s = t_s - self._t_s
         if step_s <= 0.0 or self._sigma == 0.0:
             return self._value
@@ -244,9 +245,9 @@ class OrnsteinUhlenbeck:
 
 
 class DriftingBias:
-    """An offset drawn at boot that walks: ``b_k = b_(k-1) + walk sqrt(dt) n``.
+    """An offset with a random walk: ``b_k = b_(k-1) + walk sqrt(dt) n``, from ``start``.
 
-    ``walk``: standard deviation of the change within one second; grows with the square root of the time.
+    ``walk``: standard deviation of the change within one second; it grows with the square root of the time.
     """
 
     def __init__(self, start: float, walk: float, step_s: float, rng: np.random.Generator) -> None:
@@ -263,7 +264,7 @@ class DriftingBias:
 
 
 class TrueWheels(NamedTuple):
-    """Measures of the true robot; the scales are true over nominal radius of each wheel."""
+    """Parameters of the true robot; the scales are true / nominal radius of each wheel."""
 
     radius_m: float
     right_scale: float
@@ -273,7 +274,7 @@ class TrueWheels(NamedTuple):
 
 
 def draw_wheels(robot: RobotConfig, lag_s: float, world: WorldConfig, rng: np.random.Generator) -> TrueWheels:
-    """Measures of the true robot: four draws, whatever is switched off."""
+    """Parameters of the true robot; always four draws, also if an error is zero."""
     right, left, base = (float(n) for n in rng.standard_normal(3))
     lag = 2.0 * float(rng.random()) - 1.0
     return TrueWheels(
@@ -298,7 +299,7 @@ class WheelSlip:
         self.right = self.left = 0.0  # share of each wheel's travel that is lost now
 
     def step(self, t_s: float, dt_s: float, is_ordered: bool) -> None:
-        """Go on to a frame in which the wheels turn or should; frames at rest may be left out.
+        """Advance to a frame in which a wheel turns or has a set point; frames at rest may be left out.
 
         ``t_s`` is the start of the frame; ``is_ordered``: a set point is not zero.
         """
@@ -312,7 +313,7 @@ class WheelSlip:
 
 
 def downhill(plant: Plant, gravity: Vector3) -> tuple[float, float, float]:
-    """Part of ``gravity`` (deck frame) in the tangent plane along robot x and y, and its length: the slope."""
+    """Component of ``gravity`` (deck frame) in the tangent plane along robot x and y, and its length: the slope."""
     gx, gy, gz = gravity
     hx, hy, lx, ly, fx, fy = plant.hx, plant.hy, plant.lx, plant.ly, plant.fx, plant.fy
     # Both axes are tangents of the surface, so their third component is the slope along them.
@@ -322,7 +323,7 @@ def downhill(plant: Plant, gravity: Vector3) -> tuple[float, float, float]:
 
 
 class Creep:
-    """The body glides downhill while it drives; ``rng`` is that of the walk of the creep."""
+    """The body slides downhill while it drives; ``rng`` draws the Ornstein-Uhlenbeck part."""
 
     def __init__(self, mirror: Mirror, world: WorldConfig, rng: np.random.Generator) -> None:
         self._gravity = mirror.gravity_deck
@@ -352,12 +353,12 @@ class Vibration:
         self._ways_m = noise_stream(place, world.vibration_speed_m_s * frame_s / sqrt(2.0))
         self._pushes_m_s2 = noise_stream(acceleration, world.vibration_acceleration_m_s2 / sqrt(2.0))
         self._angle = self._ahead = self._push = 0.0
-        self.is_thrusting = False  # the fans thrust in the next frame; to be set before it
+        self.is_thrusting = False  # the fans thrust in the next frame; set it before
 
     def displace(
         self, plant: Plant, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
     ) -> BodyStep:
-        """Replace the jitter of the frame before by this frame's; without thrust it goes back to nothing."""
+        """Replace the jitter of the last frame by that of this frame; without thrust it is zero."""
         angle, ahead, push = self._angle, self._ahead, self._push
         if self.is_thrusting:
             self._angle, self._ahead = next(self._angles_rad), next(self._ways_m)

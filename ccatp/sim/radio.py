@@ -1,4 +1,4 @@
-"""Parts of the true world of a robot among beacons: commands, readings, obstacles, radio signals, the moving radio."""
+"""Parts of the true world of a robot among beacons: commands, readings, obstacles, radio signals, moving target."""
 
 from collections.abc import Iterable, Sequence
 from math import atan2, cos, hypot, inf, log10, pi, sin, sqrt, tau
@@ -13,7 +13,7 @@ from ccatp.links.beacon_messages import BeaconFrame
 
 
 class SimDriveCommand(NamedTuple):
-    """Set points until the next step; steering angle (Ackermann) or turn rate (differential drive) to the left."""
+    """Set points until the next step; steering angle (Ackermann) or turn rate (differential drive), left positive."""
 
     speed_m_s: float
     steer_rad: float
@@ -38,7 +38,7 @@ class WheelReading(NamedTuple):
 
 
 class WorldFrame(NamedTuple):
-    """All readings of one step; ``extras`` as the link has them, received at its end."""
+    """All readings of one step; ``extras`` in the form of the link, received at the end of the step."""
 
     time_s: float
     wheels: WheelReading
@@ -49,7 +49,7 @@ Point = tuple[float, float]
 
 
 def count_between(a_m: Point, b_m: Point, obstacles: Iterable[SimObstacleConfig]) -> int:
-    """How many obstacles the segment from one place to another passes through."""
+    """Number of obstacles that intersect the segment between two points."""
     return sum(_distance_to_segment((o.x_m, o.y_m), a_m, b_m) < o.radius_m for o in obstacles)
 
 
@@ -114,11 +114,11 @@ def _wave_vectors(length_m: float, rng: np.random.Generator) -> NDArray[np.float
 
 
 _NEAREST_M = 0.05  # two antennas are never nearer: the log-distance model has no value at zero
-_BEYOND_WALLS_M = 1.0  # things that reflect stand in the room and as far as this round it
+_BEYOND_WALLS_M = 1.0  # reflectors are in the room or at most this far outside
 
 
 class Ray(NamedTuple):
-    """One way of a signal to the receiver; ``level_dbm`` as an antenna without direction would receive it."""
+    """One path of a signal to the receiver; ``level_dbm``: level at an omnidirectional antenna."""
 
     direction_rad: float
     level_dbm: float
@@ -130,11 +130,11 @@ class _Reflection(NamedTuple):
 
 
 class TrueRadio:
-    """The way from one sender to the receiver on the vehicle.
+    """The radio channel from one sender to the receiver on the vehicle.
 
-    The direct ray has P_ref - 10 eta log10(r), the shadowing of both places, and the loss of each obstacle in the
-    line of sight. Each reflected ray comes by a place of its own, drawn once, with the path loss of the whole way and a
-    loss of its own. ``reference_dbm`` is P_ref of the sender, at 1 m.
+    The level of the direct ray is P_ref - 10 eta log10(r), plus the shadowing of both places, minus the loss of each
+    obstacle in the line of sight. Each reflected ray has its own reflector, drawn once, the path loss of its whole path
+    and its own reflection loss. ``reference_dbm`` is P_ref of the sender, at 1 m.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class TrueRadio:
         self._reflections = [_drawn_reflection(size_m, cfg, places) for _ in range(cfg.multipath_paths)]
 
     def rays(self, pose: TruePose, sender_m: Point) -> list[Ray]:
-        """All ways of the signal from a sender to the vehicle, the direct one first."""
+        """All rays from a sender to the vehicle, the direct one first."""
         here_m = (pose.x_m, pose.y_m)
         blocked_db = self._cfg.obstacle_loss_db * count_between(here_m, sender_m, self._obstacles)
         gain_db = self._shadowing.at(here_m, sender_m) - blocked_db
@@ -158,9 +158,10 @@ class TrueRadio:
         return found
 
     def sight(self, pose: TruePose, sender_m: Point) -> tuple[float, float] | None:
-        """The result of a scan, drawn; None if lost.
+        """The drawn result of a scan; None if the packet is lost.
 
-        Level, dBm, and direction of the strongest ray with noise, to the nearest step, rad left of the heading.
+        Level, dBm, and direction of the strongest ray, with noise and rounded to the nearest step, rad left of the
+        heading.
         """
         strongest = max(self.rays(pose, sender_m), key=lambda ray: ray.level_dbm)
         level_dbm = self._received(strongest.level_dbm)
@@ -182,7 +183,7 @@ class TrueRadio:
         return self._reference_dbm - 10.0 * self._cfg.exponent * log10(distance_m)
 
     def _gain_db(self, ray: Ray, direction_rad: float) -> float:
-        """Of the reflector: 12 dB per squared beam width off the axis, down to the back lobe."""
+        """Gain of the reflector, dB: -12 (angle / beam width)^2, at least that of the back lobe."""
         off = wrap_pi(ray.direction_rad - direction_rad) / self._cfg.beam_width_rad
         return -min(12.0 * off * off, self._cfg.front_to_back_db)
 
@@ -211,8 +212,8 @@ def _seen_from(pose: TruePose, place_m: Point) -> float:
 class MovingTarget:
     """A point that moves.
 
-    At random: its course is a random walk, turned back by walls and obstacles as light is by mirrors. Along waypoints:
-    straight from one to the next, from the last to the first, through whatever stands there.
+    ``random``: its course is a random walk, mirrored at walls and obstacles. ``waypoints``: straight from one to the
+    next, from the last to the first, also through obstacles.
     """
 
     def __init__(
@@ -231,7 +232,7 @@ class MovingTarget:
             self._walk(self._cfg.speed_m_s * interval_s)
 
     def approach(self, place_m: Point, travel_m: float) -> None:
-        """Go straight at a place, so far."""
+        """Move straight towards a place, by at most ``travel_m``."""
         dx_m, dy_m = place_m[0] - self.position_m[0], place_m[1] - self.position_m[1]
         share = min(1.0, travel_m / max(hypot(dx_m, dy_m), 1e-9))
         self.position_m = (self.position_m[0] + share * dx_m, self.position_m[1] + share * dy_m)
@@ -248,7 +249,7 @@ class MovingTarget:
         self.position_m = self._turned_back(x_m, y_m)
 
     def _turned_back(self, x_m: float, y_m: float) -> Point:
-        """Out of an obstacle that a step would lead into, with the course mirrored at its surface."""
+        """The position (x, y), or if it is in an obstacle, the nearest one on its surface, with the course mirrored."""
         for obstacle in self._obstacles:
             dx_m, dy_m = x_m - obstacle.x_m, y_m - obstacle.y_m
             distance_m = hypot(dx_m, dy_m)

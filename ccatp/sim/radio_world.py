@@ -1,4 +1,4 @@
-"""The true world of a robot among radio beacons: one call a step, commands in, readings out.
+"""The true world of a robot among radio beacons: each step takes a command and returns readings.
 
 The vehicle has Ackermann or differential drive, wheels that slip, a heading that drifts, and noisy odometry.
 """
@@ -31,11 +31,12 @@ from ccatp.sim.radio import (
 
 
 class TrueVehicle:
-    """A vehicle that obeys its commands at once within its limits.
+    """A vehicle that follows its commands without lag, within its limits.
 
     Ackermann, 2017 eq. 3 (x, y of the front axle): x += T v cos(theta + gamma), y += T v sin(theta + gamma),
-    theta += T v sin(gamma) / l. Differential drive: the chord of a circular arc. The body makes (1 - slip) of the
-    wheels' travel and turns with the drift besides; the odometry measures neither and has white noise.
+    theta += T v sin(gamma) / l. Differential drive: the chord of a circular arc. The travel of the body is (1 - slip)
+    times that of the wheels, and the heading has an additional drift; the odometry measures neither and has white
+    noise.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class TrueVehicle:
         self._geometry, self._truth, self._rng, self.pose = geometry, truth, rng, pose
 
     def step(self, command: SimDriveCommand, interval_s: float) -> WheelReading:
-        """Drive for an interval (s); its odometry."""
+        """Drive for an interval (s); return its odometry."""
         limits, truth = self._geometry, self._truth
         speed_m_s = _clamped(command.speed_m_s, limits.speed_max_m_s)
         travel_m = speed_m_s * (1.0 - truth.slip) * interval_s
@@ -79,12 +80,12 @@ def _clamped(value: float, limit: float) -> float:
 
 Point = tuple[float, float]
 _Incident = TypeVar("_Incident", RadioLossConfig, ObstacleIncidentConfig, TargetApproachConfig)
-# Streams of random numbers of a seed: what one of them draws does not depend on the use of another.
+# Streams of random numbers of a seed: the draws of one do not depend on the others.
 _START, _WHEELS, _TARGET, _DISTANCES, _PLACES, _NOISE = range(6)
 
 
 class RadioWorld:
-    """Vehicle, beacons, moving target, obstacles, and scheduled incidents: lost radios, obstacles, the target comes."""
+    """Vehicle, beacons, moving target, obstacles, and planned incidents: lost radios, obstacles, target approach."""
 
     def __init__(self, cfg: RadioConfig, seed: int | None = None) -> None:
         seed = cfg.run.seed if seed is None else seed
@@ -111,26 +112,26 @@ class RadioWorld:
 
     @property
     def pose(self) -> TruePose:
-        """Where the vehicle is."""
+        """True pose of the vehicle."""
         return self._vehicle.pose
 
     @property
     def target_m(self) -> Point | None:
-        """Where the moving radio is; None without one."""
+        """Position of the moving radio; None without one."""
         return None if self._cfg.sim.target.motion == "none" else self._target.position_m
 
     @property
     def beacons_m(self) -> dict[str, Point]:
-        """Where the static radios are, by name."""
+        """Positions of the static radios, by name."""
         return {name: (beacon.x_m, beacon.y_m) for name, beacon in self._cfg.sim.beacons.items()}
 
     @property
     def clearance_m(self) -> float:
-        """Between the vehicle's body and the nearest obstacle; negative after a collision."""
+        """Distance between the vehicle's body and the nearest obstacle, m; negative in a collision."""
         return clearance_m(self.pose, self.obstacles) - self._cfg.vehicle.radius_m
 
     def step(self, command: SimDriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
-        """Drive on, then receive."""
+        """Drive for an interval, then take the readings; ``static``, ``target``: scan these radios."""
         obstacles = self._lasting(ObstacleIncidentConfig)
         self.obstacles[:] = self._cfg.sim.obstacles
         self.obstacles += [SimObstacleConfig(x_m=one.x_m, y_m=one.y_m, radius_m=one.radius_m) for one in obstacles]
@@ -145,7 +146,7 @@ class RadioWorld:
         return WorldFrame(self.time_s, wheels, BeaconFrame(radio=radio, scan=scan, distances=self._distances_m()))
 
     def _lasting(self, kind: type[_Incident]) -> list[_Incident]:
-        """The incidents of a kind that last now."""
+        """The active incidents of a kind."""
         incidents = [one for one in self._cfg.sim.incidents if isinstance(one, kind)]
         return [one for one in incidents if one.at_s <= self.time_s < one.at_s + one.for_s]
 

@@ -3,18 +3,19 @@
 Choices the interface leaves open:
 
 * The boot is frame 0 at t = 0, with one sample of each sensor.
-* A set point holds for a whole frame, so drive and permit must last to the end of the frame for it to be driven.
-* Without a drive in force the echo has seq -1; ages count from the arrival of what came into force last, at most from
-  the boot.
-* The link's delays are whole frames. The frame read at t is delivered when the clock shows t + the sensors' delay,
-  the truth is that of the clock.
-* The battery stays full, ``faults`` stays empty, nothing fails without a fault plan (``ccatp.sim.fault_injector``).
-* A reboot by plan takes no time. On the link, clock and frames count from it; ``seq`` and ``t_s`` here, the truth and
-  the times of the plan go on.
+* A set point holds for a whole frame, so it applies only if drive and permit are valid to the end of the frame.
+* Without a drive in force the echo has seq 0. Ages count from the arrival of the last drive and permit that took
+  effect; they are 0 before the first of the boot.
+* The link's delays are whole frames. The frame read at t is delivered at t + the sensors' delay; the truth has no
+  delay.
+* Without a fault plan (``ccatp.sim.fault_injector``) the battery stays full, ``faults`` stays empty and nothing fails.
+* A planned reboot takes no time. On the link, clock and frames restart from 0; ``seq`` and ``t_s`` here, the truth and
+  the times of the plan continue.
 
 Requests for the true state (SI; puck in the world frame, start pose in the deck frame):
 
-* ``b"puck"``: ``{"t", "puck": [x, y, z], "moved_m"}``, ``moved_m`` the furthest within the last measuring time;
+* ``b"puck"``: ``{"t", "puck": [x, y, z], "moved_m"}``, ``moved_m``: largest distance of the robot from its present
+  position within the last measuring time;
 * ``b"misalignment"``: ``{"panels": [[row, col, piston_m, tip_rad, tilt_rad], ...], "start": [x, y, heading]}``.
 """
 
@@ -41,11 +42,11 @@ _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48,
 
 
 class Robot(LinkedRobot, SurveyTruth):
-    """The robot from one boot to the next, at base where no ``start`` is given.
+    """The survey robot; without ``start`` it starts at base, with a drawn error.
 
-    ``rng`` is the parent of every random draw. ``delivered_rows``: ``delivered`` with plain tuples for samples, before
-    the faults of its delivery; leave it as it is. ``ValueError``: the rates put more samples in a frame than a line may
-    hold, or a frame outlasts the TTL.
+    ``rng`` is the parent of all generators. ``delivered_rows``: ``delivered`` with plain tuples for samples, before the
+    faults of its delivery; do not change it. Raises ``ValueError`` if a frame may have more samples than a line can
+    hold, or is longer than the time-to-live.
     """
 
     def __init__(
@@ -98,12 +99,12 @@ class Robot(LinkedRobot, SurveyTruth):
             before = self.world.plant.pose
             right, left = injector.act(self.world, self.fans, before_s, (right, left))
             if self.world.plant.pose != before:
-                self._sensors.edges.place(self.world.plant)  # they do not see the way of a body that was put elsewhere
+                self._sensors.edges.place(self.world.plant)  # no readings between the old and the new place
         self.world.step(before_s, self.frame_s, right, left, self.fans.thrust)
         self._read()
 
     def _reboot(self, injector: Injector) -> None:
-        """No command of the boot before stays; the fans go to their floor."""
+        """Discard all commands and undelivered frames; the fans go to their floor."""
         health = self.fans.health
         self.reboots += 1
         self._boot()
@@ -113,9 +114,9 @@ class Robot(LinkedRobot, SurveyTruth):
 
     @property
     def delivered(self) -> Sensors | None:
-        """The frame that reached the clients at this instant, ``None`` while none has.
+        """The frame that reached the clients at this instant, ``None`` if there is none.
 
-        Equal in every number to decoding ``delivered_line``. Made at the first use and then shared: do not change it.
+        Its numbers are those decoded from ``delivered_line``. It is made at the first use and shared: do not change it.
         """
         if self._delivered is None and self.delivered_rows is not None and self.injector is None:
             self._delivered = as_message(self.delivered_rows)

@@ -1,10 +1,10 @@
-"""The robot's sensors: what they read of the plant, at their own rates and with the world's errors; frames of readings.
+"""The robot's sensors: readings of the plant, each sensor at its own rate and with the world's errors.
 
-Samples are plain tuples in the order of the robot link, rounded as a real sensor bus would. Every sensor draws from its
+Samples are plain tuples in the order of the robot link, rounded as by a real sensor bus. Every sensor draws from its
 own stream, so that its noise depends on the seed alone, not on the rates of the others.
 
-The panels' true edges are shifted along their normals, rigidly, as the panels were mounted. The shift acts on the edge
-sensors alone. The rim over which the robot falls stays the ideal one.
+Each true panel edge is shifted along its normal, to represent the mounting of the panels. The shift affects the edge
+sensors only; the rim at which the robot falls stays the ideal one.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,18 +22,18 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.plant import BLOCK, WHOLE, DriftingBias, Plant, noise_stream
 
-_SAME_RATIO = 1e-9  # rates this near to a whole ratio are meant to be one
+_SAME_RATIO = 1e-9  # a ratio of rates this close to an integer is taken as the integer
 _BLOCK_FRAMES = 512  # instants are computed ahead for so many frames
-_PER_UNIT = 1e7  # resolution of rates in rad/s: far below every noise, short on the wire
+_PER_UNIT = 1e7  # steps per unit of a rounded reading: a step is far below every noise, and the line stays short
 
 WheelTuple = tuple[float, float, float]
 ImuTuple = tuple[float, float, float]
 GravityTuple = tuple[float, float, float, float]
 MIN_GAP_M = 2e-4
 
-# A sensor is sampled along the chord of its way within a frame; the arc departs from it by microns.
+# A sensor is sampled along the chord of its path within a frame, which differs from the arc by microns.
 _ROUNDING_M = 1e-9
-# Way of a sensor in the deck plane over that of the body; the curvature turns the body's axes by less than this.
+# Upper bound of the displacement of a sensor in the deck plane over that of the body; the surface is curved.
 _CURVED = 1.01
 
 Rectangle = tuple[float, float, float, float]
@@ -57,7 +57,7 @@ _NO_TIMES = SampleTimes([], [], [])
 def sample_times(hz: float, frame_hz: float, lag_s: float, frame: int, count: int) -> list[SampleTimes]:
     """Instants ``n / hz`` that fall into ``count`` frames ``((k-1)/frame_hz, k/frame_hz]`` from k = ``frame`` on.
 
-    Frame 0 is the single instant of boot, and is alone.
+    For frame 0 the result is the single instant of the boot.
     """
     if frame == 0:
         return [SampleTimes([0.0], [1.0], [1.0])]
@@ -107,8 +107,8 @@ class RateEncoders:
 class CountingEncoders:
     """Rates that are differences of counted angles, ``rate = counts (2 pi / counts_per_rev) hz``.
 
-    The wheel's angle is floored to whole counts at each sample. The sum of rates times the sample period is the counted
-    angle exactly, so nothing is rounded here. The place of the first count is drawn for each wheel.
+    The wheel's angle is floored to whole counts at each sample. The rates are not rounded, so that their sum times the
+    sample period is exactly the counted angle. The initial phase of the counter is drawn for each wheel.
     """
 
     def __init__(self, world: WorldConfig, hz: float, frame_s: float, rng: np.random.Generator) -> None:
@@ -122,8 +122,8 @@ class CountingEncoders:
         """(t, right, left) wheel rates of the frame."""
         if plant.are_wheels_still:
             return [(t, 0.0, 0.0) for t in times.times_s]
-        # The angle at tau is angle_0 + set tau + lag T (1 - exp(-tau/T)); all in counts, half a one less, so that
-        # rounding finds the whole counts below.
+        # The angle at tau is angle_0 + set tau + lag T (1 - exp(-tau/T)); all in counts, minus 0.5, so that rounding
+        # gives the floor.
         per_rad, unit, whole = self._per_rad, self._unit, WHOLE
         right, left = self._counts
         right_0, left_0 = plant.start_angles_rad
@@ -145,8 +145,8 @@ class CountingEncoders:
 class InertialUnit:
     """Reads ``ax + bias(t) + noise`` and ``wz (1 + scale) + bias(t) + noise``.
 
-    What is added does not depend on the motion, so it is made ahead in blocks. Scale and biases are three draws,
-    whatever is switched off; ``bias_rng`` is the parent of their generators.
+    Biases and noise do not depend on the motion, so they are drawn ahead in blocks. Scale and biases always take three
+    draws, also if they are zero; ``bias_rng`` is the parent of their generators.
     """
 
     def __init__(
@@ -189,10 +189,10 @@ class InertialUnit:
 def draw_rectangles(
     mirror: Mirror, panels: PanelsConfig, sigma_m: float, rng: np.random.Generator
 ) -> dict[PanelId, Rectangle]:
-    """The material of each panel as mounted: four draws per panel, in the order of ``mirror.panels``.
+    """The rectangle of each panel as mounted: four draws per panel, in the order of ``mirror.panels``.
 
-    An edge never shifts outwards by more than half the gap less half of ``MIN_GAP_M``: neighbours keep that much
-    between them, and every panel stays in its own cell, so that a cell and a rectangle give what lies at a point.
+    An edge shifts outwards by at most half of (gap - ``MIN_GAP_M``). So neighbours keep a gap of ``MIN_GAP_M``, and
+    every panel stays in its own cell: a point can only be on the panel of its cell.
     """
     x_out = max(0.0, 5e-4 * (panels.pitch_x_mm - panels.size_x_mm) - 0.5 * MIN_GAP_M)
     y_out = max(0.0, 5e-4 * (panels.pitch_y_mm - panels.size_y_mm) - 0.5 * MIN_GAP_M)
@@ -216,10 +216,10 @@ def _outer_sides(panel: PanelId, material: Mapping[PanelId, Rectangle]) -> Recta
 
 
 class EdgeSensors:
-    """Whether there is panel material under each edge sensor; ``place`` before the first ``read``.
+    """Whether there is panel material under each edge sensor; call ``place`` before the first ``read``.
 
-    While every sensor is known to be further from the edges of its panel than it has moved since, nothing is looked up.
-    ``offsets_m``: places of the sensors, robot frame, shape (4, 2). ``material`` is that of the panels.
+    The panels are looked up again only when a sensor may have moved as far as its distance from an edge at the last
+    look-up. ``offsets_m``: positions of the sensors, robot frame, shape (4, 2). ``material``: rectangles of the panels.
     """
 
     def __init__(
@@ -243,7 +243,7 @@ class EdgeSensors:
         return [(x + a * hx + b * lx, y + a * hy + b * ly) for a, b in self._offsets]
 
     def place(self, plant: Plant) -> None:
-        """Put the sensors where the plant is."""
+        """Take the pose of the plant, without readings on the way to it."""
         self._body = plant.x_m, plant.y_m, plant.hx, plant.hy, plant.lx, plant.ly
         self._look()
 
@@ -252,7 +252,7 @@ class EdgeSensors:
         return self._inside_m(x, y) >= 0.0
 
     def _inside_m(self, x: float, y: float) -> float:
-        """Distance from the edges of the panel under a point; negative beside it."""
+        """Least distance of a point from the edges of the panel of its cell, m; negative outside the panel."""
         panel = self._panel_at(x, y)
         if panel is None:
             return -1.0
@@ -260,7 +260,7 @@ class EdgeSensors:
         return min(x - x0, x1 - x, y - y0, y1 - y)
 
     def outer_edge_m(self, x: float, y: float) -> float:
-        """Distance from where the panel under a point, as mounted, ends at the rim; inf where none does."""
+        """Distance of a point from the nearest edge of its panel that has no neighbour, m; inf if all have one."""
         panel = self._panel_at(x, y)
         if panel is None:
             return inf
@@ -294,7 +294,7 @@ class EdgeSensors:
 
 
 class SensorSuite:
-    """All sensors of the robot; ``rng`` is the parent of their generators, ``lag_s`` that of the true wheel servos."""
+    """All sensors of the robot; ``rng`` is the parent of their generators, ``lag_s``: of the true wheel servos."""
 
     def __init__(self, cfg: Config, mirror: Mirror, rng: np.random.Generator, *, lag_s: float) -> None:
         sim, world = cfg.sim.robot, cfg.world
@@ -326,7 +326,7 @@ class SensorSuite:
     ) -> tuple[list[EdgeTuple], list[ImuTuple], list[WheelTuple], GravityTuple | None]:
         """Edge, inertial and encoder samples of a frame, and the newest reading of gravity within it.
 
-        Frames count from 1; frame 0 is the instant of boot. Once per frame, after the plant's step.
+        Frames count from 1; frame 0 is the instant of boot. Call it once per frame, after the plant's step.
         """
         at = frame - self._ahead_from
         if not 0 <= at < len(self._ahead):
@@ -341,7 +341,7 @@ class SensorSuite:
         )
 
     def read_lateral(self, plant: Plant, decay: float) -> float:
-        """Acceleration along robot y without gravity, which the link does not have, m/s^2; vibration as white noise."""
+        """Acceleration along robot y without gravity, m/s^2; vibration is white noise. The link does not report it."""
         return plant.lateral_acceleration_at(decay) + self._lateral_bias_m_s2 + next(self._lateral_noise)
 
     def _look_ahead(self, frame: int) -> None:
@@ -373,5 +373,5 @@ def as_message(frame: RobotFrame) -> Sensors:
 
 
 def named(kind: type[_Row], rows: Iterable[tuple[object, ...]]) -> list[_Row]:
-    """The rows as named tuples; five times as fast as calling the class for each."""
+    """The rows as named tuples; five times as fast as a call of the class for each."""
     return list(map(tuple.__new__, repeat(kind), rows))

@@ -1,4 +1,4 @@
-"""The truth of one run: where the robot really is, how the panels really lie, and whether it fell."""
+"""The truth of one run: the true pose of the robot, the true panel misalignments, and whether the robot has fallen."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -14,20 +14,20 @@ from ccatp.mirror.rim import NearOutline
 from ccatp.sim.plant import Creep, Disturbance, Plant, Vibration, WheelSlip, draw_wheels
 from ccatp.sim.sensors import EdgeSensors
 
-# seq, t, x, y, psi, X, Y, Z (surface point, deck), clearance of the worst edge sensor, fallen, sensors beyond the rim
+# seq, t, x, y, psi, X, Y, Z (surface point, deck), least edge sensor clearance, fallen, mask of sensors beyond the rim
 TruthRow = tuple[int, float, float, float, float, float, float, float, float, int, int]
 
 NEAR_RIM_M = 0.25
 FAR_CLEARANCE_M = 1.0
-"""Stands for the clearance while the robot's origin is more than ``NEAR_RIM_M`` from the rim."""
+"""Largest reported clearance, also while the robot's origin is more than ``NEAR_RIM_M`` from the rim."""
 
 
 class World:
     """Robot on mirror.
 
-    ``rng`` is the parent of the generators; the draws of one kind do not depend on the others. ``pushes`` move the body
-    besides the disturbances of the configuration. The robot stands at ``start``; at base, with an error, by default.
-    ``grip`` and ``sensors`` may be set before a step.
+    ``rng`` is the parent of the generators; the draws of one kind do not depend on the others. ``pushes`` are further
+    disturbances, besides those of the configuration. The robot starts at ``start``, by default at base with a drawn
+    error. ``grip`` and ``sensors`` may be set before a step.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class World:
         self._thrust_floor, self._fall_thrust_s = sim.fan_floor, sim.fall_thrust_s
         self._weak_s = 0.0
         self.is_fallen, self.fall = False, ""  # why it fell: ``rim``, ``thrust`` or ``grip``
-        self.grip = (1.0, 1.0)  # share of its travel that each wheel, right and left, gives besides its slip
+        self.grip = (1.0, 1.0)  # (right, left) body travel / wheel travel, besides the slip
         self._places: deque[tuple[float, float]] = deque(maxlen=window_frames + 1)
         self._places.append((self.plant.x_m, self.plant.y_m))
         self._overhang, self._rim = mirror.overhang, NearOutline(mirror.rim)
-        # The origin's distance to the rim is known to be at least this; it shrinks with the distance driven.
+        # Lower bound of the origin's distance to the rim; each step subtracts the distance driven.
         self._rim_bound_m = -inf
         self.sensors: EdgeSensors | None = None  # for their clearance in the truth rows
         self._has_looked = False
@@ -87,7 +87,7 @@ class World:
         self._places.append((plant.x_m, plant.y_m))
         if self._overhang:
             self._weak_s = self._weak_s + dt_s if thrust < self._thrust_floor else 0.0
-            # Half a frame of slack: a sum of steps is not exact.
+            # Half a frame of tolerance, because the sum of steps has rounding errors.
             if self._weak_s >= self._fall_thrust_s - 0.5 * dt_s:
                 self._fall("thrust")
         if plant.is_moving:
@@ -99,7 +99,7 @@ class World:
                     self._fall("rim")
 
     def displace(self, dx_m: float, dy_m: float, dheading_rad: float) -> None:
-        """Put the robot elsewhere: deck frame, relative to where it is. Beyond the rim it falls."""
+        """Move the robot by an offset, deck frame. Beyond the rim it falls."""
         plant = self.plant
         plant.place(plant.x_m + dx_m, plant.y_m + dy_m, plant.heading_rad + dheading_rad)
         self._has_looked = False
@@ -108,7 +108,7 @@ class World:
             self._fall("rim")
 
     def lose_grip(self) -> None:
-        """It has left the surface."""
+        """Let the robot fall, because it has left the surface."""
         self._fall("grip")
 
     def _fall(self, why: str) -> None:
@@ -116,7 +116,7 @@ class World:
         self.plant.stop_dead()
 
     def truth_row(self, seq: int, t_s: float) -> TruthRow:
-        """The truth at a frame."""
+        """The truth at frame ``seq``."""
         if not self._has_looked:
             self._look()
         p = self.plant
@@ -124,13 +124,13 @@ class World:
         return seq, t_s, x, y, heading_rad, x, y, p.z_m, self._clearance_m, int(self.is_fallen), self._off_mask
 
     def _look(self) -> None:
-        """Clearance and mask of the sensors: only on request, and only near the rim."""
+        """Compute clearance and mask of the edge sensors; far from the rim they are constants."""
         self._has_looked = True
         self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
         if self._rim_bound_m < NEAR_RIM_M:
             self._measure_rim()
         if self._rim_bound_m < NEAR_RIM_M and self.sensors is not None:
-            # A panel may end short of the rim as it is drawn: there the robot's edge sensors see it.
+            # A panel as mounted may end before the ideal rim; the edge sensors detect the end of the panel.
             distance_m, outer_edge_m = self._rim.signed_distance_m, self.sensors.outer_edge_m
             clearances_m = [min(distance_m(x, y), outer_edge_m(x, y)) for x, y in self.sensors.places]
             self._clearance_m = min(FAR_CLEARANCE_M, *clearances_m)
@@ -141,13 +141,13 @@ class World:
         self._rim_bound_m = self._rim.signed_distance_m(self.plant.x_m, self.plant.y_m)
 
     def puck_world(self) -> Vector3:
-        """Centre of the puck on the panel as it really lies, world frame, m."""
+        """Centre of the puck on the misaligned panel, world frame, m."""
         pose = self.plant.pose
         panel = self.mirror.nearest_panel(pose.x_m, pose.y_m)
         return misaligned_puck_world(self.mirror, panel, self.misalignments[panel], pose, self._puck_height_m)
 
     def moved_m(self) -> float:
-        """Furthest the robot was from its present place within the last window, m."""
+        """Largest distance of the robot from its present position within the last window, m."""
         x, y = self._places[-1]
         fx, fy = self.mirror.surface.gradient(x, y)
         farthest = 0.0
@@ -158,7 +158,7 @@ class World:
 
 
 def draw_start(base: PanelPose, cfg: Config, rng: np.random.Generator) -> PanelPose:
-    """Where the robot is really put down: base plus normal errors in x, y and heading of the panel frame."""
+    """The true start pose: base plus normal errors in x, y and heading, panel frame."""
     dx, dy, turn = (float(n) for n in rng.standard_normal(3))
     sigma_m, sigma_rad = cfg.world.start_position_sigma_m, cfg.world.start_heading_sigma_rad
     return PanelPose(base.panel, base.x_m + sigma_m * dx, base.y_m + sigma_m * dy, base.heading_rad + sigma_rad * turn)
