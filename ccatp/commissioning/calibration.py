@@ -1,8 +1,8 @@
 """Weighted least squares for wheel radii, wheel base and gyroscope bias over all segments of a drive together.
 
-Unknown are the parameters and the pose at every fix; known, each with its covariance, are the fixes, where the wheels
-lead from each pose to the next, and the change of heading that the gyroscope measured. How much slip varies from motion
-to motion is chosen so that chi^2 equals the degrees of freedom, and widens all uncertainties with it.
+The unknowns are the parameters and the pose at every fix. The measurements, each with its covariance, are the fixes,
+the dead reckoning of each segment, and the change of heading by the gyroscope. The standard deviation of the wheel slip
+is chosen so that chi^2 equals the degrees of freedom; all other uncertainties grow with it.
 """
 
 from dataclasses import asdict, dataclass
@@ -25,14 +25,14 @@ MIN_TURN_RAD = 1.0
 MIN_WAY_M = 0.05
 _ROUNDS = 8
 _CONVERGED = 1e-4  # of a standard deviation
-# What the midpoint rule and the rounding of samples leave.
+# Errors of the midpoint rule and of the rounding of samples.
 _FLOOR_M, _FLOOR_RAD = 5e-7, 5e-7
 _LEAST_SLIP, _MOST_SLIP = 1e-6, 0.2
 _LEAST_WAY_RAD = 1e-3  # a wheel that hardly turned in a motion gives no information
 
 
 class CalibrationError(UsageError):
-    """A drive from which nothing can be learned."""
+    """A drive that does not determine the parameters, or a result that must not be used."""
 
 
 class Estimate(NamedTuple):
@@ -44,7 +44,7 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a drive shows: radius and base in m, bias in rad/s, the difference of the radii (right less left) in m."""
+    """Result of a drive: mean radius and base in m, bias in rad/s, difference of the radii (right minus left) in m."""
 
     radius: Estimate
     base: Estimate
@@ -53,8 +53,8 @@ class Calibration:
     radius_difference_m: Estimate
     gyroscope_scale: Estimate
     creep: Estimate
-    slip_sigma: float  # how much slip varies from motion to motion; 0 where nothing shows that it does
-    chi2: float  # of all residuals, with ``slip_sigma`` as it is
+    slip_sigma: float  # of the slip of a wheel in one motion, share of its travel; 0 if chi^2 needs none
+    chi2: float  # of all residuals, with ``slip_sigma``
     degrees: int
     segments: int
 
@@ -62,15 +62,15 @@ class Calibration:
 def calibrate(mirror: Mirror, drive: RecordedDrive, cfg: Config) -> Calibration:
     """Estimate the parameters.
 
-    The search begins at the configured radius and base, which have no weight; scale of the gyroscope and downhill drift
-    (creep, part of the way) have the configured standard deviations about 0. Raises CalibrationError: too few segments,
-    or no turns or ways among them.
+    The iteration starts at the configured radius and base, which are not measurements. The scale of the gyroscope and
+    the downhill drift (creep, share of the travel) have prior mean 0 and the configured standard deviations. Raises
+    CalibrationError: too few segments, or all turns or travels are too small.
     """
     _check(drive, cfg.robot)
     problem = _Problem(mirror, drive, cfg.localizer.full_state)
     x = _first_guess(mirror, drive, cfg.robot)
     slip = 0.0
-    # The scatter of slip moves the solution, and the solution the scatter: twice is enough.
+    # The slip and the solution depend on each other: two iterations are enough.
     for _ in range(2):
         x = problem.solve(x, slip).x
         slip = problem.fitting_slip(x)
@@ -125,14 +125,14 @@ class _Problem(NamedTuple):
             if float(np.sum((rows @ step) ** 2)) < _CONVERGED**2:
                 break
         rows, residuals = self._whitened(x, self._carried(x), slip_sigma)
-        # Columns of very different size: scaled before the inverse.
+        # The columns differ by orders of magnitude: scale them before the inversion.
         scale = 1.0 / np.sqrt((rows * rows).sum(axis=0))
         covariance = np.linalg.inv((rows * scale).T @ (rows * scale)) * np.outer(scale, scale)
         degrees = rows.shape[0] - rows.shape[1]
         return _Solution(x, covariance[:PARAMETERS, :PARAMETERS], float(residuals @ residuals), degrees)
 
     def fitting_slip(self, x: FloatArray) -> float:
-        """The scatter of slip with which chi^2 equals the degrees of freedom, linearised at ``x``; it falls with it."""
+        """Slip at which chi^2, linearised at ``x``, equals the degrees of freedom; chi^2 decreases with slip."""
         carried = self._carried(x)
 
         def excess(slip_sigma: float) -> float:
@@ -160,7 +160,7 @@ class _Problem(NamedTuple):
     def _whitened(
         self, x: FloatArray, carried: list[DeadReckonedSegment], slip_sigma: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Whitened Jacobian and residuals: what is known minus what ``x`` makes of it."""
+        """Whitened Jacobian and residuals (measured minus predicted from ``x``)."""
         drive, size = self.drive, len(x)
         rows, residuals = [], []
 
@@ -190,7 +190,7 @@ class _Problem(NamedTuple):
 
 
 def _first_guess(mirror: Mirror, drive: RecordedDrive, robot: RobotConfig) -> FloatArray:
-    """Poses from the fixes, headings from the wheels, the first one so that the first way lies along it."""
+    """Positions from the fixes, headings from the wheels; the first one turns the first segment to the second fix."""
     wheels = WheelParameters(robot.wheel_radius_m, robot.wheel_radius_m, robot.wheel_base_m, 0.0)
     poses = np.zeros((len(drive.places), 3))
     poses[:, :2] = [(place.x_m, place.y_m) for place in drive.places]
@@ -205,12 +205,12 @@ def _first_guess(mirror: Mirror, drive: RecordedDrive, robot: RobotConfig) -> Fl
 def _process_covariance(
     drive: RecordedDrive, segment: Segment, carried: DeadReckonedSegment, slip_sigma: float
 ) -> FloatArray:
-    """Covariance of where a segment leads: the encoders' noise and the slip of each motion, each wheel by itself."""
+    """Covariance of the end pose of a segment: encoder noise and slip of each motion, independent for each wheel."""
     frame_s = segment.duration_s / len(segment.right_rad)
     shares = []
     for first, last in segment.motions:
         noise = drive.encoder_sigma_rad_s**2 * drive.encoder_period_s * (last - first) * frame_s
-        noise += drive.quantum_rad**2 / 6.0  # half a count at either end, uniform
+        noise += drive.quantum_rad**2 / 6.0  # two uniform errors of half a count, q^2 / 12 each
         for turned in (segment.right_rad, segment.left_rad):
             way_rad = float(np.abs(turned[first:last]).sum())
             shares.append(slip_sigma**2 + noise / max(way_rad, _LEAST_WAY_RAD) ** 2)
@@ -222,7 +222,7 @@ def _process_covariance(
 def _gyro_row(
     drive: RecordedDrive, k: int, carried: DeadReckonedSegment, x: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The gyroscope's sum: (1 + scale) (change of heading less what the curvature does) + bias times time."""
+    """Integrated gyroscope rate: (1 + scale) (change of heading - part of the surface's curvature) + bias * time."""
     segment = drive.segments[k]
     at = PARAMETERS + 3 * k
     start_rad, end_rad = float(x[at + 2]), float(x[at + 5])
@@ -239,7 +239,7 @@ def _gyro_row(
 
 # The daemon refuses a robot whose own figures differ from the configuration by more than this.
 MOST_DIFFERENCE = 0.05
-# Less certain than this, a new value would be worse than a measuring tape's.
+# Largest relative standard deviation: a measuring tape is as accurate.
 MOST_SIGMA = 0.01
 SHOWN_SLIP = 1e-4
 
@@ -254,12 +254,12 @@ class CalibrationRow(NamedTuple):
 
     @property
     def rounded(self) -> float:
-        """The value found, to a tenth of its standard deviation."""
+        """The value found, rounded to the second significant digit of its standard deviation."""
         return round(self.found, 1 - floor(log10(self.sigma)))
 
 
 def rows(cfg: Config, found: Calibration) -> tuple[CalibrationRow, CalibrationRow, CalibrationRow]:
-    """What is configured and what the drive shows."""
+    """The configured value and the result of the drive for each key."""
     return (
         CalibrationRow("robot.wheel_radius_m", cfg.robot.wheel_radius_m, *found.radius),
         CalibrationRow("robot.wheel_base_m", cfg.robot.wheel_base_m, *found.base),
@@ -268,7 +268,7 @@ def rows(cfg: Config, found: Calibration) -> tuple[CalibrationRow, CalibrationRo
 
 
 def check_usable(table: tuple[CalibrationRow, ...]) -> None:
-    """CalibrationError: a length is too uncertain, or far from what is configured, to get into a configuration."""
+    """Raise CalibrationError if a length is too uncertain, or differs too much from the configured one, to be used."""
     for row in table[:2]:
         if row.sigma > MOST_SIGMA * row.found:
             raise CalibrationError(
@@ -283,7 +283,7 @@ def check_usable(table: tuple[CalibrationRow, ...]) -> None:
 
 
 def lines(table: tuple[CalibrationRow, ...], found: Calibration) -> list[str]:
-    """For the reader."""
+    """The result as lines of text."""
     return render("calibration.txt", table=table, found=found, shown_slip=SHOWN_SLIP).splitlines()
 
 

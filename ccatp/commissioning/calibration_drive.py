@@ -17,20 +17,21 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.run_reader import Marked, in_order, open_run
 
-# A frame in which no wheel turns further than this, and this many times what its noise sums up to, is one of rest.
+# The robot is at rest in a frame if no wheel turns by more than both of these: an angle, and a multiple of the standard
+# deviation of the frame's summed encoder noise.
 REST_RAD = 2e-6
 REST_SIGMAS = 6.0
-# A frame in which a wheel turns less than this shows the noise of its encoder.
+# Encoder noise is estimated from frames in which the wheel turns by less than this.
 SLOW_RAD = 3e-5
-# Shorter rests than this part no motions.
+# Rests shorter than this do not separate motions.
 REST_FRAMES = 5
-# Of normally distributed differences: their median size over their standard deviation, and that over a sample's.
+# Median absolute difference of two normal samples to the standard deviation of one sample.
 _MEDIAN_TO_SIGMA = 1.0 / (0.6745 * 2.0**0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class FixedPlace:
-    """Where a fix saw the robot, deck frame; covariance of shape (2, 2)."""
+    """Position of the robot by a fix, deck frame; covariance of shape (2, 2)."""
 
     x_m: float
     y_m: float
@@ -39,11 +40,11 @@ class FixedPlace:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """From one fix to the next: what each wheel turned, frame by frame, shape (n,), and the gyroscope summed up."""
+    """Data between two fixes: angle of each wheel in each frame, shape (n,), and the integrated gyroscope rate."""
 
     right_rad: FloatArray
     left_rad: FloatArray
-    motions: tuple[tuple[int, int], ...]  # first and last (exclusive) frame of each; together all frames
+    motions: tuple[tuple[int, int], ...]  # first and last (exclusive) frame of each; they cover all frames
     gyro_rad: float
     gyro_s: float
     gyro_samples: int
@@ -56,9 +57,9 @@ class RecordedDrive:
 
     places: tuple[FixedPlace, ...]
     segments: tuple[Segment, ...]
-    encoder_sigma_rad_s: float  # of a rate sample; 0 of a counter
+    encoder_sigma_rad_s: float  # of a rate sample; 0 for a counter
     encoder_period_s: float
-    quantum_rad: float  # of a counter; 0 where the rate itself is read
+    quantum_rad: float  # one count of a counter; 0 if the encoder measures the rate
     gyro_sigma_rad_s: float
 
 
@@ -73,7 +74,7 @@ class _Open:
 
 
 class DriveBuilder:
-    """Takes a drive as it comes: frames and fixes, in their order."""
+    """Builds a drive from frames and fixes in the order of their arrival."""
 
     def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
         self._mirror, self._puck_height_m = mirror, puck_height_m
@@ -90,7 +91,7 @@ class DriveBuilder:
         self._t_s = 0.0
 
     def frame(self, sensors: Sensors) -> None:
-        """Take a frame; one that is not newer is left out."""
+        """Add a frame; a frame that is not newer than the last one is ignored."""
         if sensors.seq <= self._last_seq:
             return
         self._last_seq, self._t_s = sensors.seq, sensors.t
@@ -102,7 +103,7 @@ class DriveBuilder:
             turned.append(wheel.add([t for t, _ in samples], [rate for _, rate in samples]))
         if len(right) > 1:
             times = [t for t, _ in right]
-            if abs(self._open.right[-1]) < SLOW_RAD:  # motion is no noise
+            if abs(self._open.right[-1]) < SLOW_RAD:
                 self._scatters.append(float(np.std([rate for _, rate in right], ddof=1)))
             self._periods.append((times[-1] - times[0]) / (len(times) - 1))
             self._samples = len(times)
@@ -116,7 +117,7 @@ class DriveBuilder:
             self._gyro = t_s, rate_rad_s
 
     def fix(self, fix: Fix) -> None:
-        """Take a fix of the robot at rest; a second one at the same place replaces the first."""
+        """Add a fix of the robot at rest; a second fix without motion in between replaces the first."""
         place = self._place(fix)
         done, self._open = self._open, _Open(begun_s=self._t_s)
         if not self._places:
@@ -125,7 +126,7 @@ class DriveBuilder:
         right, left = np.array(done.right), np.array(done.left)
         motions = _motions(right, left, self._rest_rad())
         if not motions:
-            # A rest between two fixes at one place shows the gyroscope's bias like any other; no segment holds it.
+            # This rest has no segment of its own: keep its gyroscope sum, which contains the bias, for the next one.
             self._places[-1] = place
             self._open = replace(done, right=[], left=[])
             return
@@ -134,7 +135,7 @@ class DriveBuilder:
         self._segments.append(Segment(right, left, motions, done.gyro_rad, done.gyro_s, done.gyro_samples, duration_s))
 
     def _rest_rad(self) -> float:
-        if not self._scatters or self._wheels[0].is_counter:  # a counter at rest gives no scatter
+        if not self._scatters or self._wheels[0].is_counter:  # a counter at rest has no noise
             return REST_RAD
         noise_rad = median(self._scatters) * median(self._periods) * sqrt(self._samples)
         return max(REST_RAD, REST_SIGMAS * noise_rad)
@@ -144,7 +145,7 @@ class DriveBuilder:
         axes = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
         turn = np.array([self._mirror.rotate_deck_from_world(axis) for axis in axes]).T
         covariance = turn @ np.array(fix.covariance_m2).reshape(3, 3) @ turn.T
-        # The foot follows the puck along the surface; what it rises by the slope moves it sideways.
+        # Project the covariance onto the tangent plane: the foot of the puck lies on the surface.
         fx, fy = self._mirror.surface.gradient(x, y)
         normal = np.array([-fx, -fy, 1.0]) / np.sqrt(1.0 + fx * fx + fy * fy)
         along = (np.eye(3) - np.outer(normal, normal))[:2]
@@ -166,9 +167,9 @@ class DriveBuilder:
 
 
 def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tuple[int, int], ...]:
-    """The frames, parted into motions: by rests, and a turn in place from a way.
+    """Divide the frames into motions at each rest and at each change between turn and travel.
 
-    Together they cover all frames: wheels run down long after they seem to stand, by some micrometres in all.
+    The motions cover all frames, because wheels at apparent rest still move, by some micrometres in total.
     """
     moving = np.flatnonzero((np.abs(right) > rest_rad) | (np.abs(left) > rest_rad))
     if not len(moving):
@@ -182,7 +183,7 @@ def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tupl
 
 
 def _same_kind(is_turn: NDArray[np.bool_], first: int, last: int) -> list[tuple[int, int]]:
-    """Parts of a motion; what lasts for a few frames only belongs to what goes before it."""
+    """Parts of a motion, each either a turn or a travel; a part of few frames is added to the part before it."""
     cuts = [first, *(at for at in range(first + 1, last) if is_turn[at] != is_turn[at - 1]), last]
     spans: list[tuple[int, int]] = []
     for begin, end in pairwise(cuts):
@@ -194,13 +195,13 @@ def _same_kind(is_turn: NDArray[np.bool_], first: int, last: int) -> list[tuple[
     return spans
 
 
-# Frames summed up to a step: at 0.1 m/s and 1 rad/s one of 3 mm or 0.03 rad, whose midpoint rule is exact to 1e-4 of
-# the curvature that steering gives it.
+# Frames that are integrated in one step: 3 mm at 0.1 m/s, 0.03 rad at 1 rad/s. The relative error of the midpoint rule
+# is then 1e-4 of the curvature of the path.
 STEP_FRAMES = 3
 
 
 class WheelParameters(NamedTuple):
-    """What turns wheel angles into motion."""
+    """Radii of the wheels, wheel base, and downhill drift as a share of the travel."""
 
     right_m: float
     left_m: float
@@ -209,26 +210,27 @@ class WheelParameters(NamedTuple):
 
 
 class DeadReckonedSegment(NamedTuple):
-    """Where a segment leads from one pose, and how that depends on what is not known."""
+    """End pose of a segment by dead reckoning, and its derivatives."""
 
     end: FloatArray  # x, y (m), heading (rad), deck frame, shape (3,)
-    of_wheels: FloatArray  # derivatives of ``end`` by the four of ``WheelParameters``, shape (3, 4)
-    of_start: FloatArray  # by the pose at the start, shape (3, 3)
-    of_slip: FloatArray  # by the share of travel that right and left wheel gain in each motion, shape (3, 2 motions)
-    turn_rad: float  # the robot's own rotation; what is left of the change of heading the surface's curvature does
+    of_wheels: FloatArray  # derivatives of ``end`` with respect to ``WheelParameters``, shape (3, 4)
+    of_start: FloatArray  # with respect to the start pose, shape (3, 3)
+    of_slip: FloatArray  # to the slip (share of travel) of right and left wheel in each motion, shape (3, 2 motions)
+    turn_rad: float  # change of heading by the wheels; the rest of the change is due to the surface's curvature
 
 
-_STEPS = np.array((1e-5, 1e-5, 1e-5, 1e-3))  # relative, but for the creep
+_STEPS = np.array((1e-5, 1e-5, 1e-5, 1e-3))  # relative, except for the creep
 _TURN_RAD, _GRIP = 1e-5, 1e-4
 
 
 def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: WheelParameters) -> DeadReckonedSegment:
-    """Drive a segment again from x, y (m), heading (rad), deck frame.
+    """Dead reckoning of a segment from x, y (m), heading (rad), deck frame.
 
     The model is that of the localizer (thesis eqs 2.11, 2.14 on the curved surface): with d = (r_R phi_R + r_L phi_L)/2
     and turn = (r_R phi_R - r_L phi_L)/b the deck position moves by d h(psi + turn/2) + c |d| g, and the heading by
-    turn - fy (fxx dx + fxy dy) / ((1 + fx^2) W). One column for each set of parameters: as given, each of the four
-    changed, the heading changed, and the grip of either wheel in each motion; the surface is that under the first.
+    turn - fy (fxx dx + fxy dy) / ((1 + fx^2) W). The derivatives are finite differences. The arrays have one column for
+    each set of parameters: unchanged, each of the four changed, the heading changed, and the slip of either wheel in
+    each motion changed. All columns use the surface's slope at the position of the first.
     """
     steps = np.array((*wheels[:3], 1.0)) * _STEPS
     columns = 6 + 2 * len(segment.motions)
@@ -250,7 +252,7 @@ def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: WheelPara
                 continue
             right, left = right_m * phi_r * grip_right, left_m * phi_l * grip_left
             d, turn = 0.5 * (right + left), (right - left) / base_m
-            # In the middle of the step, by the duration of the last one.
+            # Slope at the middle of the step, extrapolated from the step before.
             fx, fy, fxx, fxy, _, gx, gy = terrain.at(float(x[0]) + 0.5 * dx0, float(y[0]) + 0.5 * dy0)
             s2 = 1.0 + fx * fx
             s, norm = s2**0.5, (s2 + fy * fy) ** 0.5
@@ -271,14 +273,14 @@ def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: WheelPara
     return DeadReckonedSegment(ends[:, 0], away[:, 1:5] / steps, of_start, away[:, 6:] / _GRIP, turned_rad)
 
 
-# A survey has hundreds of legs; what its first ones do not show the others hardly will, and time grows with the cube.
+# A survey has hundreds of legs. The first ones determine the parameters, and the run time grows with their cube.
 MAX_FIXES = 60
 
 
 def read_drive(run_dir: Path) -> tuple[RecordedDrive, Mirror, Config]:
-    """The newest recording of a run: its drive, its mirror, its configuration.
+    """Drive (up to ``MAX_FIXES`` fused fixes), mirror and configuration of a run's newest recording.
 
-    Raises RunReadError: there is no recording that can be read. Raises ConfigError: its configuration cannot be used.
+    Raises RunReadError: no recording can be read. Raises ConfigError: its configuration cannot be used.
     """
     recording = open_run(run_dir)[-1]
     cfg = recording.config({})

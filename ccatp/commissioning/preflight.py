@@ -23,16 +23,16 @@ from ccatp.survey.composition import robot_problems
 
 
 class CheckOutcome(StrEnum):
-    """How a check went."""
+    """Result of a check."""
 
     PASS = "pass"  # noqa: S105 - no password
     WARN = "warn"  # a mission is possible; the operator should know
     FAIL = "fail"
-    SKIP = "skip"  # what it would check is not there
+    SKIP = "skip"  # the part to check is not available
 
 
 class PreflightResult(NamedTuple):
-    """One check, whose name its list gives it; ``todo`` says what to do and is empty where all is well."""
+    """Result of one check; the list of checks sets ``name``. ``todo`` is the advice, empty if there is none."""
 
     name: str
     outcome: CheckOutcome
@@ -46,22 +46,22 @@ failed = partial(PreflightResult, "", CheckOutcome.FAIL)
 
 
 def skipped(names: Iterable[str], why: str) -> list[PreflightResult]:
-    """What could not be checked."""
+    """Results of checks that could not run."""
     return [PreflightResult(name, CheckOutcome.SKIP, why) for name in names]
 
 
 def named(**findings: PreflightResult) -> list[PreflightResult]:
-    """Findings with their names, blanks as underscores."""
+    """Findings with the keywords as names; underscores become spaces."""
     return [finding._replace(name=name.replace("_", " ")) for name, finding in findings.items()]
 
 
 def has_failed(findings: Iterable[PreflightResult]) -> bool:
-    """Whether one failed."""
+    """Whether any check failed."""
     return any(finding.outcome is CheckOutcome.FAIL for finding in findings)
 
 
 def lines(findings: Sequence[PreflightResult]) -> list[str]:
-    """The table as plain text, and what it comes to."""
+    """The table as plain text, with the number of results of each outcome."""
     counts = Counter(finding.outcome for finding in findings)
     summary = ", ".join(f"{counts[outcome]} {outcome}" for outcome in CheckOutcome if counts[outcome])
     width = max(len(finding.name) for finding in findings)
@@ -75,12 +75,12 @@ def as_json(findings: Sequence[PreflightResult]) -> dict[str, Any]:
 
 
 LASER_NAMES = ("lasers", "air", "laser fix")
-# Air as it can be at a telescope, from the sea to 6000 m.
+# Range of the air at a telescope, from sea level to 6000 m.
 TEMPERATURE_C, PRESSURE_HPA, HUMIDITY_PCT = (-40.0, 50.0), (400.0, 1100.0), (0.0, 100.0)
 
 
 def check_lasers(*, connected: bool, laser_ready: bool) -> PreflightResult:
-    """Are the lasers there, and warm?"""
+    """Whether the lasers are connected and warm."""
     if not connected:
         return failed("the server has no laser", "switch the laser unit on and connect it to its server")
     if not laser_ready:
@@ -89,7 +89,7 @@ def check_lasers(*, connected: bool, laser_ready: bool) -> PreflightResult:
 
 
 def check_air(air: Environment) -> PreflightResult:
-    """Can the air be what the server takes it for? Lengths are corrected by it."""
+    """Whether the server's air values are plausible; it corrects lengths by them."""
     found = f"{air.temperature_c:.1f} degC, {air.pressure_hpa:.0f} hPa, {air.humidity_pct:.0f} %"
     limits = (air.temperature_c, TEMPERATURE_C), (air.pressure_hpa, PRESSURE_HPA), (air.humidity_pct, HUMIDITY_PCT)
     if not all(low <= value <= high for value, (low, high) in limits):
@@ -99,7 +99,7 @@ def check_air(air: Environment) -> PreflightResult:
 
 
 def check_fix(cfg: Config, mirror: Mirror, fix: Fix) -> PreflightResult:
-    """Is the puck where a robot at base has it?"""
+    """Whether the puck is where it is on a robot at base."""
     expected = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
     off_m = dist(fix.position_m, expected)
     try:
@@ -124,7 +124,7 @@ BIAS_SIGMAS = 5.0
 
 
 class RobotReport(NamedTuple):
-    """What came from the robot: its hello, its frames in order, and when each arrived, by our monotonic clock."""
+    """Hello and frames of the robot in order, and the arrival time of each frame on this machine's monotonic clock."""
 
     cfg: Config
     mirror: Mirror
@@ -134,7 +134,7 @@ class RobotReport(NamedTuple):
 
     @property
     def span_s(self) -> float:
-        """From the first frame to the last, by the robot's clock."""
+        """Time from the first frame to the last one, robot's clock."""
         return self.frames[-1].t - self.frames[0].t
 
 
@@ -165,7 +165,7 @@ def _clock(report: RobotReport) -> PreflightResult:
     found = f"runs at {ratio:.4f} of ours, {report.frames[-1].t:.0f} s since boot {report.hello.boot}"
     if report.hello.lockstep:
         return warned("simulated, in lockstep", "a real robot has a clock of its own")
-    # What was under way at both ends blurs a short look.
+    # Delays of the first and the last frame make a short measurement inaccurate.
     if abs(ratio - 1.0) > CLOCK_TOLERANCE + 0.05 / max(ours_s, 0.1):
         return failed(found, "boot the robot; if it stays so its clock is not in order")
     return passed(found)
@@ -178,7 +178,7 @@ def _faults(report: RobotReport) -> PreflightResult:
 
 
 def _rate(kind: str, count: int, report: RobotReport) -> PreflightResult | None:
-    """A sensor that is silent or slow; one sample may be missing at the end."""
+    """The problem of a sensor that is silent or slow; one sample may be missing at the end."""
     sensor, least_hz, _ = SAMPLE_RATES[kind]
     span_s = max(report.span_s, 1e-3)
     if not count:
@@ -281,5 +281,5 @@ ROBOT_CHECKS = {
 
 
 def check_robot(report: RobotReport) -> list[PreflightResult]:
-    """All checks of a robot that stands at base."""
+    """Run all checks of a robot that stands at base."""
     return [check(report)._replace(name=name) for name, check in ROBOT_CHECKS.items()]

@@ -1,4 +1,4 @@
-"""Reads robot, laser system and machine for the check before a mission; nothing moves, nothing changes."""
+"""Reads robot, laser system and machine for the preflight checks; nothing moves, nothing changes."""
 
 import asyncio
 import ctypes
@@ -46,7 +46,7 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 
 LISTEN_S = 3.0
 FIRST_FRAME_S = 2.0
-# A mission of an hour records a tenth of this, and its database as much again.
+# A mission of one hour writes a tenth of this to its recording, and the same to its database.
 FREE_BYTES = 2_000_000_000
 WRITES, SLOW_WRITE_S = 20, 0.1
 _TIME_ERROR = 5
@@ -56,9 +56,9 @@ _LOCAL = ("127.", "localhost", "::1")
 def probe_all(
     cfg: Config, config_file: Path | None, runs_dir: Path, runtime_dir: Path | None, *, sim: bool
 ) -> list[PreflightResult]:
-    """Everything a mission needs; with ``sim`` on stand-ins of robot and laser system, which are started for it.
+    """Check everything that a mission needs; with ``sim``, start simulated robot and laser servers and check these.
 
-    Raises ConfigError: the stand-ins cannot listen.
+    Raises ConfigError: the simulated servers cannot listen.
     """
     mirror = build_mirror(cfg.mirror)
     where = config_file or "the default one"
@@ -73,7 +73,7 @@ def probe_all(
         return [*robot, *laser]
 
     with ExitStack() as stack:
-        # What the clients would log belongs to a daemon; here it would stand in the way of the result.
+        # The clients' log lines would be mixed with the result.
         stack.callback(lambda before: structlog.configure(**before), structlog.get_config())
         structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
         if sim:
@@ -83,7 +83,7 @@ def probe_all(
 
 @contextmanager
 def _stand_ins(cfg: Config) -> Iterator[Config]:
-    """Start the stand-ins, on any free ports and by the wall clock; yields the configuration with their addresses."""
+    """Start the simulated servers on free ports in real time; yield the configuration with their addresses."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ccatp-")))
         any_port = {part: getattr(cfg.sim, part).model_copy(update={"port": 0}) for part in ("robot", "etalon")}
@@ -109,9 +109,9 @@ def _stand_ins(cfg: Config) -> Iterator[Config]:
 
 
 async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -> list[PreflightResult]:
-    """Join the robot as monitor, receive for a while, judge its frames.
+    """Join the robot as monitor, receive for ``listen_s``, and check its frames.
 
-    A monitor that sends no permit keeps the robot held.
+    The robot stays held, because this monitor sends no permit.
     """
     frames: list[Sensors] = []
     arrived_s: list[float] = []
@@ -158,7 +158,7 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
 
 
 async def probe_laser(cfg: Config, mirror: Mirror) -> list[PreflightResult]:
-    """Request state and a fix of the puck from the MultiLine server."""
+    """Request the state of the MultiLine server and a fix of the puck at base."""
     quick = cfg.etalon.model_copy(update={"reconnect_for_s": 0.0})
     client = EtalonClient(quick, mirror.channels, mirror.collimators_m)
     try:
@@ -189,13 +189,13 @@ async def probe_laser(cfg: Config, mirror: Mirror) -> list[PreflightResult]:
 def probe_machine(
     cfg: Config, runs_dir: Path, runtime_dir: Path | None, environ: Mapping[str, str]
 ) -> list[PreflightResult]:
-    """Clock, disk, runtime directory, real time."""
+    """Check clock, disk, runtime directory and real-time priority."""
     others = named(runtime_directory=_runtime_dir(cfg, runtime_dir, environ), real_time=_real_time(cfg))
     return [*named(machine_clock=_clock()), *_disk(runs_dir), *others]
 
 
 def probe_key(cfg: Config, *, sim: bool) -> PreflightResult:
-    """The key of the robot link; those of the observatory channel are judged where it is served."""
+    """Check the key of the robot link."""
     try:
         key = read_key(cfg.robot.key_file, must_be_private=not sim)
     except CcatpError as error:
@@ -214,13 +214,13 @@ def _observatory(cfg: Config) -> PreflightResult:
 
 
 def _clock() -> PreflightResult:
-    """Whether the machine's time is synchronised: logs and recordings are compared by it."""
+    """Whether the machine's clock is synchronised: logs and recordings are compared by it."""
     found = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
     if time.gmtime().tm_year < 2025:
         return failed(found, "set the clock; is its battery empty?")
     if sys.platform != "linux":
         return passed(found)
-    # struct timex is 208 bytes long; with its first field, the modes, zero the state is only read.
+    # struct timex has 208 bytes; with its first field (modes) zero, adjtimex only reads the state.
     state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(256))
     if state in (-1, _TIME_ERROR):
         return warned(f"{found}, not synchronised", "logs may not fit those of others: start chrony or timesyncd")
@@ -228,7 +228,7 @@ def _clock() -> PreflightResult:
 
 
 def _disk(runs_dir: Path) -> list[PreflightResult]:
-    """Free room and speed where runs are written; ``runs_dir`` itself is made by the first run."""
+    """Free space and write speed of the disk for runs; ``runs_dir`` itself may not exist before the first run."""
     place = runs_dir.absolute()
     if place.exists() and not place.is_dir():
         return named(disk=failed(f"{place} is no directory", "name another with --runs-dir"))

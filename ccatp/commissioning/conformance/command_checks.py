@@ -1,8 +1,8 @@
-"""Checks of what the robot does with commands: drive and permit, newest only, lost sessions, fans, odd lines.
+"""Checks of the robot's reaction to commands: drive and permit, sequence numbers, lost sessions, fans, bad lines.
 
-The wheels stand still by command. Fan duties change by a few hundredths, below the floor in ``fan_floor`` alone.
-The ages in a frame say on the robot's clock when a message arrived, so a slow network or a stalled client is never
-taken for a fault of the robot.
+The commanded wheel rates are zero. Fan duties change by a few hundredths; only ``fan_floor`` requests less than the
+floor. The ages in a frame give the arrival time of a message on the robot's clock, so a slow network or a stalled
+client is not reported as a fault of the robot.
 """
 
 import time
@@ -32,17 +32,17 @@ from ccatp.links.robot_messages import Fans
 
 CHECKS = CheckList()
 check, check_steady = CHECKS.add, partial(CHECKS.add, fixture=steady)
-AFTER_TTL_S = 0.3  # watched beyond the time-to-live
-SHORT_S = 0.12  # wall time in which a message on loopback or a local network has arrived, below every useful ttl_s
+AFTER_TTL_S = 0.3  # observed after the end of the time-to-live
+SHORT_S = 0.12  # wall time within which a message arrives on loopback or a local network; below every useful ttl_s
 NOISE_S = 0.08  # between bad lines: fewer than 20 a second
 ATTEMPTS = 6
 AHEAD = 1000
 LOST_S = 0.05
-EARLY_FRAMES, LATE_FRAMES = 2, 3  # a robot acts from frame to frame
+EARLY_FRAMES, LATE_FRAMES = 2, 3  # a robot acts once a frame
 FAN_STEPS = 0.05, 0.03  # left, right
 ENDINGS: tuple[Ending, Ending] = ("FIN", "RST")
 TOLERATED = 20  # bad lines in a second
-CROWD = 150  # drives in one segment, some 8 KiB
+CROWD = 150  # drives in one segment, about 8 KiB
 STRANGERS = 40
 BYTE_S = 0.002  # between single bytes
 
@@ -76,7 +76,7 @@ check_steady("ttl-permit", "a permit is in force for ttl_s", "real time")(partia
 
 
 def _noise(key: Key, line: bytes, pair: ControllerAndMonitor) -> str:
-    """The controller sends lines that renew nothing, in the place of drives or permits."""
+    """The controller sends lines that must not count as a drive or permit, in place of drives or permits."""
     facts = pair.facts
     pair.withhold(key)
     first, begin_s = len(pair.frames), pair.newest.t
@@ -93,7 +93,10 @@ check_steady("role-permit", "permits are the monitor's", "real time")(partial(_n
 
 
 def check_ttl(frames: Sequence[Frame], key: Key, ttl_s: float, frame_s: float) -> str:
-    """Held in time, in frames from the last drive or permit on, while the other is renewed in each frame."""
+    """The robot is held when the last drive or permit expires, and not before.
+
+    ``frames`` begin at that drive or permit; the other command is renewed in each frame.
+    """
     held_s: float | None = None
     has_moved, age_s = False, 0.0
     for frame in frames:
@@ -141,7 +144,8 @@ def _newest_drive(pair: ControllerAndMonitor) -> str:
     _pause_and_settle(pair)
     in_force = [frame for frame in pair.frames[first:] if frame.cmd.seq == again]
     require(bool(in_force), f"drive {again} never came into force")
-    # The age does not start again. A robot that makes up for late frames reports 0 for what arrived after their time.
+    # The age must not start again. A robot that sends late frames afterwards reports age 0 for a message that arrived
+    # after the frame's time.
     arrivals_s = [frame.arrival_s("drive") for frame in in_force if frame.cmd.age > 0.0]
     spread_s = max(arrivals_s) - min(arrivals_s) if arrivals_s else 0.0
     late = f"a second drive {again} came into force {1e3 * spread_s:.0f} ms after the first"
@@ -150,7 +154,7 @@ def _newest_drive(pair: ControllerAndMonitor) -> str:
 
 
 def _pause_and_settle(pair: ControllerAndMonitor) -> None:
-    """Wait until the robot has taken what was sent, then answer frames again."""
+    """Wait until the sent messages have arrived, then answer frames again."""
     pair.pause(SHORT_S)
     pair.rates, pair.allowed = STILL, ALL
     pair.settle()
@@ -168,7 +172,7 @@ def _newest_permit(pair: ControllerAndMonitor) -> str:
     if pair.facts.lockstep:
         in_force = _answered_frame(pair)
     else:
-        half_s = 0.5 * pair.facts.ttl_s  # older than any that was on its way
+        half_s = 0.5 * pair.facts.ttl_s  # then no earlier permit is still on its way
         in_force = pair.expect(lambda frame: frame.cmd.permit_age >= half_s, "permits do not age")
     # The age shows which permit is in force.
     latest_s = in_force.arrival_s("permit") + 0.5 * pair.facts.frame_s
@@ -185,7 +189,7 @@ def _newest_permit(pair: ControllerAndMonitor) -> str:
 
 @check_steady("role-drive", "drives are the controller's")
 def _wrong_role(pair: ControllerAndMonitor) -> str:
-    seq = pair.newest.cmd.seq + AHEAD  # once obeyed it stays the newest for a while
+    seq = pair.newest.cmd.seq + AHEAD  # if the robot accepts it, it stays the newest for some frames
     pair.monitor.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0}\n' % (seq, pair.newest.seq))
     pair.find(lambda frame: frame.cmd.seq == seq, 10 * pair.facts.frame_s)
     require(pair.newest.cmd.seq != seq, f"drive {seq} of the monitor came into force")
@@ -198,7 +202,7 @@ def _wrong_role(pair: ControllerAndMonitor) -> str:
 
 
 def _lost(key: Key, ending: Ending, context: CheckContext) -> str:
-    """The session that sends one of the two ends, and the other sends a last message right behind."""
+    """The session that sends ``key`` ends, and the other session sends a last message immediately after."""
     witness: Key = "permit" if key == "drive" else "drive"
     for _ in range(ATTEMPTS):
         with steady(context) as pair:
@@ -221,17 +225,17 @@ def _end(pair: ControllerAndMonitor, key: Key, witness: Key, ending: Ending) -> 
         pair.drive()
     enough_s = 0.7 * pair.facts.ttl_s
     pair.run(enough_s)
-    # A robot that makes up for late frames may be behind: watch until the last message is old enough by its own clock.
+    # A robot that sends late frames afterwards may be behind: wait until the last message is old enough by its clock.
     pair.find(lambda frame: frame.age_s(witness) >= enough_s)
     return pair.frames[first:]
 
 
 def check_lost(frames: Sequence[Frame], witness: Key, ttl_s: float, frame_s: float) -> str | None:
-    """Held in time after one session ended and the other sent a last message right behind.
+    """The robot is held within ``LOST_S`` after one session ended and the other sent a last message immediately after.
 
-    The arrival of that message, the witness, is the moment at which the loss was there, too. ``frames`` reach from the
-    end of the session over some 0.2 s; ``None`` if they do not reach over the time in question. ``NotApplicable`` where
-    the time-to-live is so short that it would hold the wheels as soon.
+    The arrival time of that message, the witness, is taken as the time of the loss. ``frames`` begin at the end of the
+    session; ``None`` if none of them lies between the limit and the end of the time-to-live. ``NotApplicable`` if the
+    time-to-live is so short that it would hold the wheels as early.
     """
     if ttl_s < LOST_S + 4 * frame_s:
         raise NotApplicable(f"ttl_s {ttl_s:g} holds the wheels as soon")
@@ -258,7 +262,7 @@ for _role, _key in LOST:
 
 @contextmanager
 def _changed_fans(context: CheckContext) -> Iterator[ControllerAndMonitor]:
-    """Fans at another duty than they were found at; put back at the end."""
+    """Change the fan duties; restore them at the end."""
     pair = ControllerAndMonitor(context)
     left, right = pair.steady().fans
     pair.duty = duty = other_duty((left, right), context.facts.robot.fan_floor)
@@ -279,7 +283,7 @@ check_fans = partial(CHECKS.add, fixture=_changed_fans)
 
 
 def other_duty(duty: Pair, lowest: float) -> Pair:
-    """Duties that differ from these, and are allowed; ``NotApplicable`` where there are none."""
+    """Other allowed duties (left, right); ``NotApplicable`` if the floor leaves no room."""
     if lowest > 1.0 - max(FAN_STEPS):
         raise NotApplicable(f"a floor of {lowest:g} leaves no room")
     left, right = (v + step if v <= 1.0 - step else v - step for v, step in zip(duty, FAN_STEPS, strict=True))
@@ -339,7 +343,7 @@ def _fans_after_stop(pair: ControllerAndMonitor) -> str:
 def _fans_after_lost(ending: Ending, pair: ControllerAndMonitor) -> str:
     """Both sessions end, one after the other, and join again."""
     pair.controller.end(ending)
-    if not pair.facts.lockstep:  # there the monitor sees no frame without the controller
+    if not pair.facts.lockstep:  # in lockstep there is no new frame without the controller
         pair.rates = None
         _check_unchanged(pair, pair.run_frames(10), f"by a lost controller ({ending})")
     pair.monitor.end(ending)
@@ -373,7 +377,7 @@ def _fan_floor(pair: ControllerAndMonitor) -> str:
 
 # -- lines ------------------------------------------------------------------------------------------------------------
 
-# Drives with one thing wrong each; %d is the number, then the frame.
+# Drives with one error each; the first %d is seq, the second is ack.
 BAD_DRIVES: dict[str, tuple[str, bytes]] = {
     "no-json": ("a line that is no JSON is dropped", b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0\n'),
     "key-twice": ("a key that stands twice makes a bad line",
@@ -389,7 +393,7 @@ BAD_DRIVES: dict[str, tuple[str, bytes]] = {
 
 
 def _dropped(template: bytes, pair: ControllerAndMonitor) -> str:
-    """A bad drive with the higher number in front of a good one: only if it is dropped does the good one count."""
+    """A bad drive with a higher number before a good one: the good one is accepted only if the bad one is dropped."""
     good = pair.context.next_seq()
     bad = good + 1
     pair.drive(good, before=template % (bad, pair.newest.seq))
@@ -412,7 +416,7 @@ def _unknown_key(pair: ControllerAndMonitor) -> str:
 
 @check_steady("unknown-type", "an unknown type is ignored, and no bad line")
 def _unknown_type(pair: ControllerAndMonitor) -> str:
-    # More lines at once than bad ones are allowed in a second.
+    # More lines than the number of bad lines allowed in a second.
     _check_tolerated(pair, b'{"type":"dance","seq":7,"partner":null}\n' * STRANGERS)
     return f"{STRANGERS} lines of an unknown type, the session goes on"
 
@@ -477,7 +481,7 @@ def _single_bytes(context: CheckContext) -> str:
 def _many_lines(pair: ControllerAndMonitor) -> str:
     before, first = pair.newest.seq - 1, pair.context.next_seq()
     last = pair.context.last_seq = first + CROWD - 1
-    # Only the last answers the newest frame: where time waits for that, it waits for all of them.
+    # Only the last one answers the newest frame: in lockstep the clock waits for it, and so for all of them.
     crowd = b"".join(format_drive(seq, before, 0.0, 0.0) for seq in range(first, last))
     pair.drive(last, before=crowd)
     pair.echoed(last, otherwise=f"the last of {CROWD} drives in one segment was not obeyed")
@@ -495,7 +499,7 @@ def _glued_lines(pair: ControllerAndMonitor) -> str:
 
 
 def _check_obeyed(pair: ControllerAndMonitor, line: Callable[[int, int], bytes], otherwise: str) -> None:
-    """Send a drive as it is, and answer frames until it is echoed."""
+    """Send a drive line unchanged, and answer frames until it is echoed."""
     seq = pair.context.next_seq()
     pair.controller.send(line(seq, pair.newest.seq))
     pair.mark_driven()
@@ -503,7 +507,7 @@ def _check_obeyed(pair: ControllerAndMonitor, line: Callable[[int, int], bytes],
 
 
 def _check_tolerated(pair: ControllerAndMonitor, lines: bytes) -> None:
-    """Send lines that change nothing, and go on."""
+    """Send lines that must have no effect, and check that the session continues."""
     pair.controller.send(lines)
     pair.run_frames(5)
     pair.settle()

@@ -1,6 +1,6 @@
-"""What every check uses: the list of checks, messages as types, and clients of the server under test.
+"""Common parts of all checks: the list of checks, message types, and clients of the server under test.
 
-Messages are read leniently, so that a check can go on; ``parse`` judges the parts that a check or all of them need.
+Messages are decoded without validation, so that a check can continue; ``parse`` validates the parts that a check needs.
 """
 
 import json
@@ -30,23 +30,23 @@ STILL: Pair = (0.0, 0.0)
 ALL: Allowed = (True, True, True)
 NOTHING: Allowed = (False, False, False)
 POLL_S = 0.05
-COMMAND_LIMIT_S = 2.0  # robot's time in which a command must have come into force
+COMMAND_LIMIT_S = 2.0  # robot time within which a command must be in force
 TOP_SPEED_M_S = 1.0
-DUTY_TOLERANCE = 0.01  # a duty in eight bits
-# Numbers between two of these are free for messages that must be older or newer than others.
+DUTY_TOLERANCE = 0.01  # the robot may store a duty in eight bits
+# The numbers between two steps are for messages that must be older or newer than others.
 SEQ_STEP = 10
-# Far over the 8192 allowed: a line of the server that is too long fails a check, not the buffer.
+# Far above the 8192 allowed: a server's line that is too long fails a check and does not overflow the buffer.
 _LIMIT_BYTES = 1 << 20
 _CHUNK_BYTES = 1 << 16
 _RESET = b"\x01\0\0\0\0\0\0\0"  # linger on, for 0 s: close sends RST
 
 
 class CheckFailed(AssertionError):
-    """The server does not do what the interface control document promises; the text is what was seen instead."""
+    """The server violates the interface control document; the text is what was observed."""
 
 
 class NotApplicable(Exception):
-    """The server promises nothing here, or nothing that can be seen; the text is the reason."""
+    """The requirement does not apply to this server or cannot be observed; the text is the reason."""
 
 
 Run = Callable[[Any], str]
@@ -54,7 +54,7 @@ Fixture = Callable[["CheckContext"], AbstractContextManager[Any]]
 
 
 class Check(NamedTuple):
-    """One check: ``run`` returns what was seen, or raises ``CheckFailed`` or ``NotApplicable``."""
+    """One check: ``run`` returns what was observed, or raises ``CheckFailed`` or ``NotApplicable``."""
 
     check_id: str
     promise: str
@@ -66,7 +66,7 @@ class CheckList(list[Check]):
     """Checks in the order in which they run."""
 
     def add(self, check_id: str, promise: str, *needs: Need, fixture: Fixture = nullcontext) -> Callable[[Run], Run]:
-        """Decorator: append a function of what the fixture makes of the context, which is the context by default."""
+        """Decorator: append a function whose argument is the value of ``fixture``, by default the context."""
 
         def append(run: Run) -> Run:
             def check(context: CheckContext) -> str:
@@ -80,7 +80,7 @@ class CheckList(list[Check]):
 
 
 def require(is_kept: bool, seen: str) -> None:
-    """Raise ``CheckFailed`` with what was seen unless a promise is kept."""
+    """Raise ``CheckFailed`` with the text ``seen`` unless the condition is true."""
     if not is_kept:
         raise CheckFailed(seen)
 
@@ -89,7 +89,7 @@ def require(is_kept: bool, seen: str) -> None:
 
 
 class Part(BaseModel):
-    """Part of a message; strict: finite numbers, no booleans or text in their place. Further keys are ignored."""
+    """Part of a message. Numbers must be finite, not booleans or text; additional keys are ignored."""
 
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
 
@@ -101,7 +101,7 @@ Three = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 def parse(model: type[PartT], message: Message, where: str = "") -> PartT:
-    """A part of a message; ``CheckFailed`` with the first key that is missing or wrong."""
+    """Validate a part of a message; ``CheckFailed`` names the first key that is missing or wrong."""
     try:
         return model.model_validate(message)
     except ValidationError as error:
@@ -126,7 +126,7 @@ class Timing(Part):
 
 
 class Body(Part):
-    """Sizes of the robot that the checks need; wheels do not turn on impossible ones."""
+    """Sizes of the robot that the checks need. With impossible sizes no check that moves the wheels runs."""
 
     wheel_radius_m: Annotated[float, Field(ge=0.005, le=0.2)]
     wheel_base_m: Annotated[float, Field(ge=0.03, le=1.0)]
@@ -142,7 +142,7 @@ class Body(Part):
 
 
 class Facts(Timing):
-    """What the checks need of the server's hello."""
+    """The parts of the server's hello that the checks need."""
 
     auth: Any = None
     robot: Body
@@ -163,9 +163,9 @@ class Echo(Part):
 
 
 class Frame(Part):
-    """What the checks need of a sensors frame.
+    """The parts of a sensors frame that the checks need.
 
-    ``enc`` holds samples (t, right, left) of the wheels, s and rad/s; ``imu`` (t, ax, wz), s, m/s^2, rad/s.
+    ``enc`` has samples (t, right, left) of the wheels in s and rad/s; ``imu`` (t, ax, wz) in s, m/s^2, rad/s.
     """
 
     seq: int
@@ -181,22 +181,22 @@ class Frame(Part):
         return self.cmd.age if key == "drive" else self.cmd.permit_age
 
     def arrival_s(self, key: Key) -> float:
-        """When that drive or permit arrived, robot's clock."""
+        """Arrival time of that drive or permit, robot's clock."""
         return self.t - self.age_s(key)
 
     def has_fans(self, wanted: Sequence[float]) -> bool:
-        """Whether the fan duties are those wanted, within ``DUTY_TOLERANCE``."""
+        """Whether the fan duties equal ``wanted`` within ``DUTY_TOLERANCE``."""
         return all(abs(a - b) <= DUTY_TOLERANCE for a, b in zip(self.fans, wanted, strict=True))
 
 
 def whole_samples(samples: object, size: int) -> list[list[float]]:
-    """The samples of a list that are so many numbers; ``frames-samples`` reports the others."""
+    """The samples of a list that have ``size`` numbers; the check ``frames-samples`` reports the others."""
     whole = [one for one in samples if isinstance(one, list) and len(one) == size] if isinstance(samples, list) else []
     return [one for one in whole if all(isinstance(value, int | float) for value in one)]
 
 
 def read_message(line: bytes) -> Message | None:
-    """The object in a line, ``None`` if there is none. Lenient: the same key twice, NaN and the like pass."""
+    """The JSON object in a line, or ``None``. Repeated keys, NaN and infinity are accepted."""
     try:
         value = json.loads(line)
     except (ValueError, RecursionError):
@@ -205,7 +205,7 @@ def read_message(line: bytes) -> Message | None:
 
 
 def shorten(line: bytes, most: int = 60) -> str:
-    """A line for a message."""
+    """The first ``most`` bytes of a line as text."""
     text = line[:most].decode("utf-8", "backslashreplace")
     return text if len(line) <= most else text + "..."
 
@@ -214,9 +214,9 @@ def shorten(line: bytes, most: int = 60) -> str:
 
 
 class RawConnection:
-    """One connection; ``lines`` were received and not yet taken, without their LF. Raises OSError: no connection.
+    """One connection; ``lines`` are received and not yet read, without their LF. Raises OSError: no connection.
 
-    ``timeout_s`` is the longest wait for the connection, and for the server to take what is sent.
+    ``timeout_s`` limits the time to connect and the time of each send.
     """
 
     def __init__(self, address: tuple[str, int], timeout_s: float) -> None:
@@ -228,7 +228,7 @@ class RawConnection:
 
     @property
     def is_open(self) -> bool:
-        """Whether this side has not closed."""
+        """Whether this side has not closed the connection."""
         return self._socket.fileno() >= 0
 
     def fileno(self) -> int:
@@ -236,14 +236,14 @@ class RawConnection:
         return self._socket.fileno()
 
     def send(self, data: bytes) -> None:
-        """Send; what the server no longer takes is lost, and the connection ended."""
+        """Send; on an error the data are lost and ``is_ended`` is true."""
         try:
             self._socket.sendall(data)
         except OSError:
             self.is_ended = True
 
     def receive(self) -> None:
-        """Take what is there; to be called when there is something."""
+        """Read the available data; call it only if ``select`` reports data."""
         try:
             data = self._socket.recv(_CHUNK_BYTES)
         except OSError:
@@ -254,7 +254,7 @@ class RawConnection:
             raise self._buffer.error
 
     def end(self, ending: Ending) -> None:
-        """End with FIN and go on reading (closing would send RST while something is unread), or close with RST."""
+        """Send FIN and keep the socket for reading (a close with unread data sends RST), or close with RST."""
         with suppress(OSError):
             if ending == "FIN":
                 self._socket.shutdown(socket.SHUT_WR)
@@ -270,9 +270,9 @@ class RawConnection:
 
 
 class CheckContext:
-    """Clients of one check; ``clear`` before the next. ``last_seq`` is the highest sequence number used so far.
+    """Clients of one check; call ``clear`` before the next check. ``last_seq``: highest sequence number used so far.
 
-    ``mirror`` is the one at whose base the robot stands, where that is known.
+    ``mirror``: the robot stands at its base; ``None`` if not known.
     """
 
     facts: Facts
@@ -284,23 +284,23 @@ class CheckContext:
         self._connections: list[RawConnection] = []
 
     def next_seq(self) -> int:
-        """A number above all that were used."""
+        """A sequence number above all numbers used so far."""
         self.last_seq += SEQ_STEP
         return self.last_seq
 
     def connect(self) -> RawConnection:
-        """A new connection. Raises OSError: it is not accepted."""
+        """A new connection. Raises OSError: the server does not accept it."""
         self._connections.append(RawConnection(self._address, self.timeout_s))
         return self._connections[-1]
 
     def poll(self, wait_s: float = POLL_S) -> None:
-        """Receive on all connections that have something, waiting for the first at most so long."""
+        """Receive on all connections with data; wait at most ``wait_s`` for the first."""
         reading = [one for one in self._connections if one.is_open and not one.is_ended]
         for one in select.select(reading, [], [], wait_s)[0]:
             one.receive()
 
     def until(self, is_done: Callable[[], bool], wait_s: float | None = None) -> bool:
-        """Receive until something is done; false when it is not within ``wait_s`` (the time-out by default)."""
+        """Receive until ``is_done`` is true; false after ``wait_s`` (the time-out by default)."""
         deadline_s = time.monotonic() + (self.timeout_s if wait_s is None else wait_s)
         while not is_done():
             left_s = deadline_s - time.monotonic()
@@ -310,11 +310,11 @@ class CheckContext:
         return True
 
     def is_closed(self, connection: RawConnection, wait_s: float | None = None) -> bool:
-        """Whether the server closes a connection in time."""
+        """Whether the server closes a connection within ``wait_s`` (the time-out by default)."""
         return self.until(lambda: connection.is_ended, wait_s)
 
     def message(self, connection: RawConnection, *kinds: str) -> Message:
-        """The next message on a connection; ``CheckFailed`` where it is not of one of these types."""
+        """The next message on a connection; ``CheckFailed`` if it has none of these types, or none comes."""
         wanted = " or ".join(kinds)
         self.until(lambda: bool(connection.lines) or connection.is_ended)
         seen = "connection closed" if connection.is_ended else "silence"
@@ -326,7 +326,7 @@ class CheckContext:
         return message
 
     def greet(self) -> tuple[RawConnection, Message]:
-        """A new connection and its hello; ``CheckFailed`` where it is not accepted or there is no hello."""
+        """A new connection and its hello; ``CheckFailed`` if it is not accepted or no hello comes."""
         try:
             connection = self.connect()
         except OSError as error:
@@ -334,7 +334,7 @@ class CheckContext:
         return connection, self.message(connection, "hello")
 
     def join_line(self, hello: Message, role: Role, mac: str | None = None) -> bytes:
-        """The right answer to a hello, or one with another mac; ``NotApplicable`` without the key it needs."""
+        """The join that answers a hello, with the right mac or the given one; ``NotApplicable`` without the key."""
         if mac is None and self.facts.needs_mac:
             if self.key is None:
                 raise NotApplicable("the server asks for a mac, and there is no key")
@@ -352,9 +352,9 @@ class CheckContext:
         return self.message(connection, "joined", "refused")
 
     def join(self, role: Role, retry_s: float | None = None) -> RawConnection:
-        """A session; ``CheckFailed`` if refused.
+        """A new session; ``CheckFailed`` if refused.
 
-        The session before may not have ended yet, so a role that is taken is requested again for ``retry_s`` (the
+        The previous session may not have ended yet, so a role that is taken is requested again for ``retry_s`` (the
         time-out by default).
         """
         deadline_s = time.monotonic() + (self.timeout_s if retry_s is None else retry_s)
@@ -379,8 +379,9 @@ class ControllerAndMonitor:
 
     ``rates``: (right, left) set points of the drive that answers each frame, rad/s; ``None`` sends none. ``allowed``:
     (forward, reverse, turn) of the permit that answers each frame; ``None`` sends none. ``messages``: sensors messages
-    as they came, of the controller and of the monitor. ``duty``: of the fans, (left, right), where a check changed it.
-    ``received_s``: when each of the ``frames`` came; ``sent_s``: when each drive was sent, by its number; this clock.
+    as received, of the controller and of the monitor. ``duty``: (left, right) fan duties that a check has set.
+    ``received_s``: arrival time of each of the ``frames``; ``sent_s``: send time of each drive by its number. Both are
+    times of this machine's monotonic clock.
     """
 
     def __init__(self, context: CheckContext) -> None:
@@ -397,7 +398,7 @@ class ControllerAndMonitor:
 
     def join(self) -> None:
         """Begin both sessions."""
-        # The monitor first: from its join on the robot needs both keys, so it never waits for one alone.
+        # The monitor joins first: after that the robot always needs drive and permit.
         self.monitor = self.context.join("monitor")
         self.controller = self.context.join("controller")
         self.answer_again()
@@ -417,7 +418,7 @@ class ControllerAndMonitor:
     # -- commands -------------------------------------------------------------------------------------------------
 
     def drive(self, seq: int | None = None, rates: Pair = STILL, ack: int | None = None, before: bytes = b"") -> int:
-        """Send a drive that answers the newest frame (or another), with other bytes in front; returns its number."""
+        """Send ``before`` and a drive that answers the newest frame (or frame ``ack``); return the drive's number."""
         seq = self.context.next_seq() if seq is None else seq
         self.sent_s[seq] = monotonic()
         self.controller.send(before + format_drive(seq, self.newest.seq if ack is None else ack, *rates))
@@ -426,7 +427,7 @@ class ControllerAndMonitor:
         return seq
 
     def permit(self, seq: int | None = None, allowed: Allowed = ALL, ack: int | None = None) -> int:
-        """Send a permit that answers the newest frame (or another); returns its number."""
+        """Send a permit that answers the newest frame (or frame ``ack``); return its number."""
         seq = self.context.next_seq() if seq is None else seq
         self.monitor.send(format_permit(seq, self.newest.seq if ack is None else ack, *allowed))
         if ack is None:
@@ -434,35 +435,35 @@ class ControllerAndMonitor:
         return seq
 
     def fans(self, duty: Pair, seq: int | None = None) -> int:
-        """Send fan duties; returns their number."""
+        """Send fan duties; return the number of the message."""
         seq = self.context.next_seq() if seq is None else seq
         self.controller.send(encode(Fans(seq=seq, duty=duty)))
         return seq
 
     def mark_driven(self) -> None:
-        """The newest frame has been answered by a drive."""
+        """Regard the newest frame as answered by a drive."""
         self._driven = self.newest.seq
 
     def withhold(self, key: Key) -> None:
-        """Answer no more frames with a drive, or none with a permit."""
+        """Stop answering frames with a drive, or with a permit."""
         if key == "drive":
             self.rates = None
         else:
             self.allowed = None
 
     def answer_again(self) -> None:
-        """Regard the newest frame as unanswered: what was sent may have been dropped."""
+        """Regard the newest frame as unanswered: the robot may have dropped the answers."""
         self._driven = self._permitted = -1
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def find(self, is_wanted: Callable[[Frame], bool], robot_s: float = COMMAND_LIMIT_S) -> Frame | None:
-        """Answer frames until one is wanted; ``None`` after so much of the robot's time, or silence.
+        """Answer frames until ``is_wanted`` is true; ``None`` after ``robot_s`` of robot time, or after the time-out.
 
         The wanted frame itself is not answered yet.
         """
         start = len(self.frames)
-        begin_s: float | None = None  # of the first frame that comes: before it may have been a long pause
+        begin_s: float | None = None  # time of the first new frame: a long pause may precede it
         quiet_s = time.monotonic()
         while True:
             self._answer()
@@ -480,7 +481,7 @@ class ControllerAndMonitor:
                 return None
 
     def expect(self, is_wanted: Callable[[Frame], bool], otherwise: str) -> Frame:
-        """Answer frames until one is wanted; ``CheckFailed`` with ``otherwise`` if none comes."""
+        """Answer frames until ``is_wanted`` is true; ``CheckFailed`` with ``otherwise`` if no such frame comes."""
         frame = self.find(is_wanted)
         if frame is None:
             self._check_sessions()
@@ -493,7 +494,7 @@ class ControllerAndMonitor:
         return self.expect(lambda frame: frame.seq > newest, otherwise)
 
     def run(self, robot_s: float) -> list[Frame]:
-        """Answer frames for so much of the robot's time; these frames."""
+        """Answer frames for ``robot_s`` of robot time; return these frames."""
         start = len(self.frames)
         if not self.frames:
             self.expect(lambda _: True, "no frames after the join")
@@ -505,11 +506,11 @@ class ControllerAndMonitor:
         return self.frames[start:]
 
     def run_frames(self, count: int) -> list[Frame]:
-        """Answer so many frames; these frames."""
+        """Answer frames for ``count`` frame periods; return these frames."""
         return self.run(count * self.facts.frame_s)
 
     def pause(self, wall_s: float) -> list[Frame]:
-        """Answer nothing for so much time of this machine; the frames that come all the same."""
+        """Answer nothing for ``wall_s``; return the frames received."""
         start = len(self.frames)
         end_s = time.monotonic() + wall_s
         while (left_s := end_s - time.monotonic()) > 0.0:
@@ -518,15 +519,15 @@ class ControllerAndMonitor:
         return self.frames[start:]
 
     def echoed(self, *seqs: int, otherwise: str) -> Frame:
-        """Send nothing newer, until the robot echoes one of these drives.
+        """Send no newer drive until the robot echoes one of these drives; return that frame.
 
-        In lockstep newer drives have to follow; there each is in force for a frame.
+        Lockstep needs newer drives; there each drive is in force for one frame.
         """
         self.rates = STILL if self.facts.lockstep else None
         return self.expect(lambda frame: frame.cmd.seq in seqs, otherwise)
 
     def steady(self) -> Frame:
-        """Drive and permit in force: standing still by command, not held."""
+        """Answer frames until a drive of zero and a permit are in force and the robot is not held."""
         self.rates, self.allowed = STILL, ALL
         first = self.context.next_seq()
         return self.expect(
@@ -535,7 +536,7 @@ class ControllerAndMonitor:
         )
 
     def settle(self) -> list[Frame]:
-        """Answer frames until all that was sent before is in force; these frames."""
+        """Answer frames until all messages sent before are in force; return these frames."""
         start = len(self.frames)
         mark = self.context.next_seq()
         self.expect(lambda frame: frame.cmd.seq > mark, "drives no longer come into force")
@@ -552,7 +553,7 @@ class ControllerAndMonitor:
             self.permit(allowed=self.allowed)
 
     def _take(self) -> bool:
-        """Read what came; whether any of it is a new frame."""
+        """Parse the received lines; return whether there is a new frame."""
         before = len(self.frames)
         for connection, messages in zip((self.controller, self.monitor), self.messages, strict=True):
             while connection.lines:

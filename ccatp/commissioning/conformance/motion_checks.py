@@ -1,4 +1,4 @@
-"""Checks of lockstep, and the checks in which wheels turn: slowly, and for a moment."""
+"""Checks of lockstep, and the checks in which wheels turn."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -26,21 +26,21 @@ from ccatp.links.robot_messages import Role
 
 CHECKS = CheckList()
 check_steady = partial(CHECKS.add, fixture=steady)
-WAIT_S = 0.3  # wall time in which a frame would have come
-REPEATED_S = 1.7  # wall time in which a frame without answers comes again
+WAIT_S = 0.3  # wall time within which a frame would arrive
+REPEATED_S = 1.7  # wall time within which a frame without answers is sent again
 BEYOND_TTL_S = 0.2
 RATE_RAD_S = 0.5
 MOVE_S = 0.8  # longest time in which a drive must show in the encoders
-SETTLE_S, MEAN_S = 0.3, 0.2  # then of the servo; of a mean
+SETTLE_S, MEAN_S = 0.3, 0.2  # time for the servo to settle after that; time of a mean
 RAMP_S = 0.6  # from one set point to another
-ATTEMPTS = 3  # where answers of a busy machine came too late
+ATTEMPTS = 3  # answers of a busy machine may be too late
 DENIED_S = 0.3
 STOP_S = 0.7  # a servo comes to rest in this time
 WINDOW = 5  # frames of one mean
-SHARE = 0.3  # of the set point: above it turns, below it stands
+SHARE = 0.3  # of the set point: above it a wheel turns, below it the wheel stands
 RATE_TOLERANCE, RATIO_TOLERANCE = 0.25, 0.1  # of the set point; of the other wheel
 BEYOND: Pair = (2.0, -1.5)  # times the top speed
-IMU_SHARE = (0.6, 1.6)  # of what the wheels do: they may slip
+IMU_SHARE = (0.6, 1.6)  # of the motion by the wheels, which may slip
 LEAST_IMU_HZ = 45.0
 G_M_S2, LEAST_SLOPE_M_S2 = 9.81, 1.0
 
@@ -119,7 +119,7 @@ def _sends_again(pair: ControllerAndMonitor) -> str:
 
 
 def notice(facts: Facts, checks: int) -> str:
-    """The most that each of so many checks moves the robot, for its operator."""
+    """Text for the operator: the largest motion in each check."""
     rate_rad_s, time_s = _rate(facts), MOVE_S + SETTLE_S + MEAN_S + facts.ttl_s
     speed_m_s = rate_rad_s * facts.robot.wheel_radius_m
     turn_rad = 2.0 * speed_m_s / facts.robot.wheel_base_m * time_s
@@ -134,7 +134,7 @@ def _rate(facts: Facts) -> float:
     return min(RATE_RAD_S, 0.25 * facts.robot.max_wheel_rad_s)
 
 
-# Name, promise, (right, left) share of the rate, and the permits (forward, reverse, turn) that allow and deny it.
+# Name, requirement, (right, left) share of the rate, permits (forward, reverse, turn) that allow and deny it.
 DIRECTIONS: tuple[tuple[str, str, Pair, Allowed, Allowed], ...] = (
     ("move-forward", "v > 0 needs forward", (1, 1), (True, False, False), (False, True, True)),
     ("move-reverse", "v < 0 needs reverse", (-1, -1), (False, True, False), (True, False, True)),
@@ -148,7 +148,7 @@ DIRECTIONS: tuple[tuple[str, str, Pair, Allowed, Allowed], ...] = (
 
 @contextmanager
 def _at_rest(context: CheckContext) -> Iterator[ControllerAndMonitor]:
-    """Both sessions, with the wheels at rest before and after, whatever happens."""
+    """Both sessions, with the wheels at rest before the check and after it, also if it fails."""
     pair = ControllerAndMonitor(context)
     try:
         pair.steady()
@@ -165,7 +165,7 @@ check_at_rest = partial(CHECKS.add, fixture=_at_rest)
 
 
 def _direction(shares: Pair, allowed: Allowed, denied: Allowed, pair: ControllerAndMonitor) -> str:
-    """A drive that is denied, then the same allowed, then denied again."""
+    """The same drive denied, then allowed, then denied again."""
     rate_rad_s = _rate(pair.facts)
     rates = rate_rad_s * shares[0], rate_rad_s * shares[1]
     pair.allowed = denied
@@ -188,7 +188,7 @@ def _direction(shares: Pair, allowed: Allowed, denied: Allowed, pair: Controller
 
 
 def _denied_again(pair: ControllerAndMonitor, denied: Allowed) -> list[Frame]:
-    """Frames in which a permit is in force that denies what goes on, none of them after its time-to-live."""
+    """Frames in which a permit that denies the motion is in force and its time-to-live is not over."""
     if pair.facts.lockstep:
         pair.allowed = denied
         pair.settle()
@@ -197,7 +197,7 @@ def _denied_again(pair: ControllerAndMonitor, denied: Allowed) -> list[Frame]:
     pair.allowed = None
     pair.permit(allowed=denied)
     pair.find(lambda frame: frame.cmd.permit_age > 0.7 * pair.facts.ttl_s)
-    # It is the last of the permits: it arrived when the age says in the end.
+    # It is the last permit, so the newest age gives its arrival time.
     since_s = pair.newest.arrival_s("permit") - 0.5 * pair.facts.frame_s
     in_force = [frame for frame in pair.frames[first:] if frame.arrival_s("permit") >= since_s]
     return [frame for frame in in_force[2:] if frame.cmd.permit_age < 0.9 * pair.facts.ttl_s]
@@ -222,7 +222,7 @@ def _stops_at_zero(pair: ControllerAndMonitor) -> str:
 
 
 def _stops(key: Key, lost: Role | None, pair: ControllerAndMonitor) -> str:
-    """Without a newer drive or permit, or when the session that sends it is lost."""
+    """The wheels stop without a newer drive or permit, or when the session that sends it is lost."""
     rate_rad_s = _rate(pair.facts) * (1.0 if lost is None else -1.0)
     _move(pair, (rate_rad_s, rate_rad_s), ALL)
     pair.withhold(key)
@@ -260,7 +260,7 @@ def _clamp(pair: ControllerAndMonitor) -> str:
 
 @check_at_rest("gyroscope", "wz is the angular rate about robot z in rad/s, left turns positive", "motion", "body")
 def _gyroscope(pair: ControllerAndMonitor) -> str:
-    """A turn on the spot and back, of which the difference has no bias."""
+    """A turn in place and back; the bias cancels in the difference."""
     rate_rad_s, robot = _rate(pair.facts), pair.facts.robot
     seen = []
     for rates in ((rate_rad_s, -rate_rad_s), (-rate_rad_s, rate_rad_s)):
@@ -278,7 +278,7 @@ def _gyroscope(pair: ControllerAndMonitor) -> str:
 
 @check_at_rest("accelerometer", "ax is the acceleration along robot x in m/s2, gravity removed", "motion", "body")
 def _accelerometer(pair: ControllerAndMonitor) -> str:
-    """Forward and back again, of which each half begins and ends at rest: the bias has no part in the difference."""
+    """Forward and backward, each from rest to rest, so that the bias cancels in the sum."""
     rate_rad_s = _rate(pair.facts)
     frames = pair.run(RAMP_S)
     rest_m_s2, fall = _imu_mean(frames, 1), [f.gravity[1] for f in frames if whole_samples([f.gravity], 4)]
@@ -301,7 +301,7 @@ def _accelerometer(pair: ControllerAndMonitor) -> str:
 
 
 def _imu_mean(frames: Sequence[Frame], column: int) -> float:
-    """Mean of acceleration (column 1) or rate (2); ``NotApplicable`` where there are too few samples."""
+    """Mean acceleration (column 1, m/s^2) or rate (column 2, rad/s); ``NotApplicable`` with too few samples."""
     samples = [sample for frame in frames[1:] for sample in whole_samples(frame.imu, 3)]
     if len(samples) < LEAST_IMU_HZ * (frames[-1].t - frames[0].t):
         raise NotApplicable(f"{len(samples)} IMU samples in {len(frames)} frames, at least {LEAST_IMU_HZ:g} Hz needed")
@@ -309,7 +309,7 @@ def _imu_mean(frames: Sequence[Frame], column: int) -> float:
 
 
 def _move(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> list[Frame]:
-    """Frames in which the wheels turn as the drive says, once they do so; ``CheckFailed`` where they do not."""
+    """Frames in which the wheels turn at the set points; ``CheckFailed`` if they do not."""
     frames = _turning(pair, rates, allowed)
     right, left = _seen_rates(frames)
     most_rad_s = RATE_TOLERANCE * max(map(abs, rates))
@@ -319,7 +319,7 @@ def _move(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> list[Fra
 
 
 def _turning(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> list[Frame]:
-    """Frames of a drive to which the servo has had time to settle, none of them held."""
+    """Frames of a drive after the servo has settled, none of them held; ``CheckFailed`` if the robot is held."""
     pair.rates, pair.allowed = rates, allowed
     for _ in range(ATTEMPTS):
         pair.run_frames(WINDOW)
@@ -342,7 +342,7 @@ def _stopped(pair: ControllerAndMonitor, end: str) -> str:
 
 
 def mean_rates(frames: Sequence[Frame]) -> Pair | None:
-    """Mean (right, left) wheel rates of all whole encoder samples in the frames, rad/s; ``None`` without samples."""
+    """Mean (right, left) wheel rates of all complete encoder samples in the frames, rad/s; ``None`` without samples."""
     samples = [sample for frame in frames for sample in whole_samples(frame.enc, 3)]
     if not samples:
         return None

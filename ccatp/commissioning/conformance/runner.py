@@ -11,7 +11,7 @@ from ccatp.mirror.mirror import Mirror
 
 CHECKS = (*server_checks.CHECKS, *command_checks.CHECKS, *motion_checks.CHECKS)
 Outcome = Literal["pass", "fail", "not applicable"]
-# With a hello that lacks what the other checks need, these two are all that can run.
+# The only checks that can run if the hello lacks what the other checks need.
 _HELLO_CHECKS = ("hello", "hello-robot")
 _WHY: dict[harness.Need, str] = {
     "motion": "--no-motion",
@@ -29,7 +29,7 @@ def check_ids() -> tuple[str, ...]:
 
 
 class Result(NamedTuple):
-    """One check's end: its identity, what the interface control document promises, how it ended, what was seen."""
+    """Result of one check: name, requirement of the interface control document, outcome, what was observed."""
 
     check_id: str
     promise: str
@@ -42,13 +42,13 @@ class NoRobot(DaemonUnreachableError):
 
 
 class KeyNeeded(UsageError):
-    """The server asks for a mac, and there is no key."""
+    """The server needs a mac, and no key is given."""
 
 
 class Conformance:
-    """The checks of one server; ``facts`` of its hello are ``None`` if it lacks what the checks need.
+    """The checks of one server; ``facts`` is ``None`` if its hello lacks what the checks need.
 
-    ``mirror``: the robot stands at its base. NoRobot: nothing at the address says hello; KeyNeeded: it asks for a key.
+    ``mirror``: the robot stands at its base. Raises NoRobot: no hello from the address; KeyNeeded: no key is given.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Conformance:
     ) -> list[Result]:
         """Run the checks in their order, or only those named; ``report`` is called with each result.
 
-        On stands the wheels turn, and the body does not. NoRobot: another program holds the robot.
+        ``on_stands``: the wheels turn but the body does not move. Raises NoRobot: another program holds the robot.
         """
         results = []
         if (facts := self.facts) is not None:
@@ -127,7 +127,7 @@ class Conformance:
         return message
 
     def _begin(self) -> None:
-        """Check that no other program holds the robot; note its fans and the highest number in use."""
+        """Check that no other program holds the robot; store its fan duties and the highest number in use."""
         try:
             frame = harness.ControllerAndMonitor(self._context).expect(lambda _: True, "no frame")
         except harness.CheckFailed as failed:
@@ -140,7 +140,7 @@ class Conformance:
             self._context.clear()
 
     def _restore(self) -> None:
-        """Fans as they were found; then no session, so that the wheels are held."""
+        """Restore the fan duties; then end all sessions, so that the wheels are held."""
         self._context.clear()
         with suppress(harness.CheckFailed, harness.NotApplicable):
             pair = harness.ControllerAndMonitor(self._context)
@@ -165,7 +165,7 @@ def as_json(server: str, results: Sequence[Result]) -> dict[str, Any]:
 
 
 def table_line(result: Result) -> str:
-    """One result; for a failure with the promise."""
+    """One result as text; a failure with its requirement."""
     detail = f"seen: {result.detail}; promised: {result.promise}" if result.outcome == "fail" else result.detail
     return f"{result.check_id:<21}{_SHORT[result.outcome]:<4}  {detail}"
 

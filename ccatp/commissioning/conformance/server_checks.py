@@ -1,4 +1,4 @@
-"""Checks of what the server sends: hello, answers to a join, sensors frames."""
+"""Checks of the messages of the server: hello, answers to a join, sensors frames."""
 
 import json
 import math
@@ -43,20 +43,20 @@ CONNECTIONS = 8
 JOIN_S = 2.0
 IN_TIME_S, LATE_S = 1.0, 2.1  # after the hello
 SILENCE_S, STILL_HELD_S, TAKEN_S = 5.0, 3.5, 5.3
-NOISE_S = 0.3  # between bad lines of a holder that sends nothing else
+NOISE_S = 0.3  # between bad lines of a session that sends no others
 ROLES: tuple[Role, Role] = ("controller", "monitor")
 FRAMES = 40  # each answered by a drive and a permit
-# Most samples a second.
+# Largest sample rates.
 MOST_HZ = {"imu": 100.0, "enc": 1000.0, "edge": 1000.0}
 PERIOD_TOLERANCE = 0.2
 RATE_TOLERANCE = 1.1
 LONGEST_TTL_S = 0.5  # the limits of the fault table rest on 0.25 s
-CLOCK_S, CLOCK_TOLERANCE = 2.0, 0.03  # 1 %, and what frames that come late add to it
-ATTEMPTS = 5  # where a busy machine looks like a fault
+CLOCK_S, CLOCK_TOLERANCE = 2.0, 0.03  # 1 % of the clock, and the jitter of the frames
+ATTEMPTS = 5  # a busy machine can look like a fault
 OLDEST_S = 0.15  # robot.sensors_timeout_s
 STALE_GRAVITY_S = 0.5
 FIRST_FRAME_S = 1.0
-NORM_TOLERANCE = 0.02  # of a unit vector in a few decimals
+NORM_TOLERANCE = 0.02  # of a unit vector with few decimals
 TIME_TOLERANCE_S = 1e-6  # times printed with six decimals
 
 Near = Annotated[float, Field(ge=-1.0, le=1.0)]
@@ -196,7 +196,7 @@ def _refused_is_harmless(pair: ControllerAndMonitor) -> str:
             connection, hello = pair.context.greet()
             pair.run_frames(2)
             if not facts.lockstep:
-                pair.rates = pair.allowed = None  # what was sent has to last
+                pair.rates = pair.allowed = None  # the commands already sent must stay in force
             connection.send(pair.context.join_line(hello, role) if line is None else line)
             require(pair.context.is_closed(connection), "a refused client's connection stays open")
             refused += 1
@@ -228,7 +228,7 @@ def _take_over(pair: ControllerAndMonitor) -> str:
         raise NotApplicable("the server or this machine is too slow for this check")
     _send_bad_lines(pair, silent_s + TAKEN_S)
     try:
-        # Not for long: now the holder is silent altogether.
+        # Retry for a short time only: now the holder sends no lines at all.
         pair.context.join("controller", retry_s=0.2 * SILENCE_S)
     except CheckFailed as failed:
         late_s = pair.newest.t - silent_s
@@ -318,7 +318,7 @@ class _FaultsPart(Part):
 def _recorded(context: CheckContext) -> Iterator[ControllerAndMonitor]:
     pair = ControllerAndMonitor(context)
     pair.run_frames(FRAMES)
-    if pair.facts.lockstep:  # a frame comes again, unchanged, where this machine was busy
+    if pair.facts.lockstep:  # a frame is sent again, unchanged, if this machine was busy
         for messages in pair.messages:
             messages[1:] = [after for before, after in pairwise(messages) if after != before]
     require(len(pair.messages[0]) > 2, "fewer than three frames for the controller")
@@ -342,7 +342,7 @@ def _lines(pair: ControllerAndMonitor) -> str:
 
 
 def line_fault(line: bytes, limit_bytes: int) -> str | None:
-    """What is wrong with a line: length, JSON, a repeated key, a number that is not finite; ``None`` if nothing."""
+    """The error of a line: length, JSON, a repeated key, a number that is not finite; ``None`` if it is correct."""
 
     def once(pairs: list[tuple[str, Any]]) -> Message:
         if len(dict(pairs)) != len(pairs):
@@ -388,7 +388,7 @@ def _clock(pair: ControllerAndMonitor) -> str:
 
 
 def check_clock(frames: Frames, frame_hz: float) -> str:
-    """Times of the frames increase, by the period of the hello."""
+    """The times of the frames increase, and their median period is that of the hello within ``PERIOD_TOLERANCE``."""
     require(frames[0]["t"] >= 0.0, f"t = {frames[0]['t']!r}")
     steps_s = []
     for before, after in pairwise(frames):
@@ -441,7 +441,7 @@ def _samples(frame: Message, name: str) -> list[list[float]]:
 
 @check_frames("frames-edge", "edge values are 0 or 1")
 def check_edges(frames: Frames) -> str:
-    """Values of the edge sensors."""
+    """Values of the edge sensors are 0 or 1."""
     samples = [sample for frame in frames for sample in _samples(frame, "edge")]
     if not samples:
         raise NotApplicable("no edge samples in these frames")
@@ -456,7 +456,7 @@ def _gravity(pair: ControllerAndMonitor) -> str:
 
 
 def check_gravity(frames: Frames, fan_floor: float = 0.0) -> str:
-    """Gravity: null, or a time and a unit vector; towards the surface unless fans hold the robot."""
+    """Gravity is null, or a time and a unit vector, which points towards the surface if ``fan_floor`` is 0."""
     found = [gravity for frame in frames if (gravity := parse(_GravityPart, frame).gravity) is not None]
     for gravity in found:
         norm = math.hypot(*gravity[1:])
@@ -507,7 +507,7 @@ def _command(frames: Frames) -> str:
 
 @check_recorded("frames-all", "every frame goes to every joined session")
 def _to_both(pair: ControllerAndMonitor) -> str:
-    """In the stretch that both received."""
+    """Compares the range of frames that both sessions received."""
     one, other = ([frame["seq"] for frame in frames] for frames in pair.messages)
     require(bool(other), "no frames for the monitor")
     first, last = max(one[0], other[0]), min(one[-1], other[-1])
@@ -547,13 +547,13 @@ def _seq_of_a_session(pair: ControllerAndMonitor) -> str:
     finally:
         context.last_seq = used
     new = pair.messages[0][first]["seq"]
-    require(new >= last, f"frame {new} of a new session after {last}")  # in lockstep the one that waits comes again
+    require(new >= last, f"frame {new} of a new session after {last}")  # equal in lockstep: the frame is sent again
     return f"drive {frame.cmd.seq} of a new session obeyed after {used}, frame {new} after {last}"
 
 
 @check_steady("clock", "the rate of the robot's clock is wrong by up to 1 %", "real time")
 def _clock_rate(pair: ControllerAndMonitor) -> str:
-    """Between the frames that were the fastest to come, of the first and of the last quarter of the time."""
+    """Rate between the frames with the shortest delay in the first and in the last quarter of the time."""
     rate = 0.0
     for _ in range(ATTEMPTS):
         first = len(pair.frames)
@@ -572,7 +572,7 @@ def _age(pair: ControllerAndMonitor) -> str:
     trip_s = math.inf
     for _ in range(ATTEMPTS):
         pair.run(FIRST_FRAME_S)
-        # A robot that makes up for late frames reports 0 for what arrived after their time: that gives no arrival.
+        # Age 0 gives no arrival time: a robot that sends late frames afterwards reports it for later messages.
         seen = [(f.cmd, at_s) for f, at_s in zip(pair.frames, pair.received_s, strict=True) if f.cmd.age > 0.0]
         trip_s = min((at_s - pair.sent_s.get(cmd.seq, -math.inf) - cmd.age for cmd, at_s in seen), default=math.inf)
         if trip_s <= OLDEST_S:
