@@ -364,7 +364,7 @@ def damage_text(path: Path, damage: str) -> str:
 
 
 RECORD_FORMAT = 3
-"""Of a recording, kept in it; one more wherever an older reader would misunderstand what is recorded."""
+"""Version of the format, stored in each recording; increased when an older reader would misunderstand the content."""
 
 # In recordings of older formats: topic, text there, and the present one. A key or value, with its quotation marks.
 _OLD_TEXTS: dict[str, dict[bytes, bytes]] = {

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ccatp.studies.campaign import Study
 
 Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
-"""A study without runs: a configuration and a directory, to what ``result.json`` holds."""
+"""A study without runs: gets a configuration and a directory for files, returns the content of ``result.json``."""
 
 # Name: module and the name in it of a Study or an Analysis; title.
 STUDIES = {

@@ -30,7 +30,7 @@ TURN = "turn"
 CROSSINGS: tuple[int | str, ...] = (0, 15, 30, 45, 60, TURN)
 RULES = {"thesis": "off for 0.1 s (thesis)", "shipped": "travel against the map (ours)"}
 OFF_S = 0.1
-"""Threshold of the thesis's rule: a gap of 1 cm at 0.1 m/s."""
+"""Threshold of the thesis's rule: the time in which a sensor crosses a gap of 1 cm at 0.1 m/s."""
 # Errors of the estimate that the rules get, as of a good localizer in a disturbed world: sigmas, drawn once per drive.
 POSITION_SIGMA_M, HEADING_SIGMA_RAD = 1.5e-3, 2e-3
 _SHOWN = (
@@ -55,7 +55,7 @@ def drive_frame(seq: int, t_s: float, enc: list[WheelSample], edge: list[EdgeSam
 
 
 EdgeRule = Callable[[Sensors, EstimateMessage], bool]
-"""Judges frame by frame: whether there is an edge."""
+"""Takes one frame after the other; returns whether there is an edge."""
 
 
 def off_time_rule(off_s: float) -> EdgeRule:

@@ -20,7 +20,8 @@ from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 
 HUBER = 2.0
-"""Knee of the robust loss, in sigmas. A loss that gives up on readings leaves beacons without any, and GTSAM stops."""
+"""Residual, in sigmas, from which the robust loss is linear. Under a loss that ignores large residuals some beacons
+would have no reading left, and GTSAM would stop."""
 LEAST_READINGS = 8
 SURE_MARGIN = 8.0
 SURE_SPREAD = 0.15

@@ -33,7 +33,7 @@ CHAPTER = 4096
 TURNING_RAD_S = 0.01
 _FIGURES, _DECIMALS = ("mean", "p50", "p99", "max"), 9  # of errors, mm
 REPRODUCED = 1e-9
-"""Largest difference, m and rad, with which a replay counts as the run again: rounding and nothing else."""
+"""Largest difference, m and rad, with which a replay counts as equal to the run: that of rounding alone."""
 
 
 # -- a filter that can be smoothed ------------------------------------------------------------------------------------
