@@ -1,4 +1,4 @@
-"""Alignment of the panels as data and text: um, urad; moves and deviations > 0 towards the robot."""
+"""Alignment of the panels as data and text: um, urad; moves and deviations are positive towards the robot."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,11 +13,11 @@ from ccatp.report.html import MICRO, render
 
 _DECIMALS = 4
 _WAVEFRONT = ("rms_before_um", "rms_before_level_um", "rms_after_um", "point_noise_um")
-_SHOWN = 12  # panels without a result that are named
+_SHOWN = 12  # largest number of panels without a result that are named
 
 
 def worst_corner(mirror: Mirror, panel: PanelResult) -> tuple[float, float]:
-    """Displacement of the corner of the fitted plane that is furthest off, and its standard deviation, m."""
+    """Largest displacement of a corner of the fitted plane, and its standard deviation, m."""
     signs = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
     modes = rigid(signs * half_size_m(mirror.panel(panel.panel)))
     values = modes @ panel.fit.values
@@ -26,7 +26,7 @@ def worst_corner(mirror: Mirror, panel: PanelResult) -> tuple[float, float]:
 
 
 def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str, Any]:
-    """What ``ccatp align --json`` prints of the panels and the mirror."""
+    """Panels and mirror in the output of ``ccatp align --json``."""
     return {
         "panels": [panel_data(panel) for panel in result.panels],
         "undetermined": [
@@ -49,7 +49,7 @@ def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str
 
 
 def panel_data(panel: PanelResult) -> dict[str, Any]:
-    """How a panel lies, its moves and its points."""
+    """Position and tilt of a panel, its moves and its points."""
     piston, tip, tilt = _list(panel.fit.values)
     bending, shape = panel.bending, panel.shape
     own = _wavefront(mirror_wavefront([panel.rigid.wavefront]))

@@ -1,6 +1,6 @@
-"""Pictures of beacon work: path loss, fixes by signal strength, the fuzzy speed, maps of motes, recorded runs.
+"""Figures of beacons: path loss, fixes by signal strength, the fuzzy speed, maps of motes, recorded runs.
 
-The suffix of a file gives its format (PNG, PDF, SVG); PictureError: it cannot be written.
+The suffix of a file gives its format (PNG, PDF, SVG). Raises PictureError: the file cannot be written.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ _REGION = 0.9
 
 
 def draw_path_loss(fit: PathLossFit, pairs: Sequence[LevelPair], name: str, out: Path) -> None:
-    """Levels over distance, the line, and where 95 % of new places are expected."""
+    """Levels over distance, the fitted line, and the band in which 95 % of new places are expected."""
     figure = new_figure(7.0, 4.4)
     axes = figure.subplots()
     distances, levels = np.array([pair[:2] for pair in pairs]).T
@@ -52,7 +52,7 @@ def draw_fixes(
     fixes: Sequence[LevelFix], truths: Sequence[tuple[float, float]], beacons_m: Mapping[str, tuple[float, float]],
     name: str, out: Path,
 ) -> None:  # fmt: skip
-    """A panel for each point (at most twelve): its 90 % region, the fix, and where it was."""
+    """A panel for each point (at most twelve): its 90 % region, the fix, and the true position."""
     shown = list(zip(fixes, truths, strict=True))[:12]
     columns = min(5, len(shown))
     rows = -(-len(shown) // columns)
@@ -104,26 +104,26 @@ def draw_fuzzy(cfg: FuzzyConfig, out: Path) -> None:
 
 
 def _span(cfg: FuzzyConfig, name: str) -> tuple[float, float]:
-    """From nought to a quarter beyond the last corner that is not far away on purpose."""
+    """From the smallest corner (at least 0) to 1.25 times the largest left shoulder; others may be very large."""
     terms = cfg.inputs[name].terms.values()
     return max(0.0, min(corner for term in terms for corner in term)), 1.25 * max(term[1] for term in terms)
 
 
 def _in_degrees(name: str, values: FloatArray) -> tuple[FloatArray, str]:
-    """An input as it is shown, and its name with its unit."""
+    """Values of an input in the displayed unit, and the label of their axis."""
     words = name.replace("_", " ")
     if name.endswith("_rad"):
         return np.degrees(values), words.removesuffix(" rad") + ", deg"
     return values, words.removesuffix(" m") + ", m"
 
 
-_CHI2_90 = 4.605  # of two degrees of freedom: the ellipse that holds nine of ten
+_CHI2_90 = 4.605  # 90 % quantile for two degrees of freedom
 _LABELLED = 40  # motes up to which each has its name beside it
 _VISIBLE = 0.012  # of the width of the map: ellipses that are smaller are drawn larger, and the title says so
 
 
 class MapPicture(NamedTuple):
-    """What is drawn of one map, in its first two coordinates."""
+    """The drawn parts of one map, in its first two coordinates."""
 
     names: Sequence[str]
     positions_m: FloatArray
@@ -146,7 +146,7 @@ class Traces(NamedTuple):
 
 
 def draw_mote_map(picture: MapPicture, traces: Traces | None, out: Path) -> None:
-    """Draw a map, and beside it the errors where there are some."""
+    """Draw a map, and next to it the errors if there are any."""
     figure = new_figure(11.0 if traces else 6.5, 6.5)
     panels = figure.subplots(1, 2 if traces else 1, squeeze=False)[0]
     _draw_places(panels[0], picture)
@@ -159,7 +159,7 @@ def draw_mote_map(picture: MapPicture, traces: Traces | None, out: Path) -> None
 
 
 def _draw_places(axes: "Axes", picture: MapPicture) -> None:
-    """Motes, truth, measured pairs and the ellipses that hold nine of ten."""
+    """Motes, true places, measured pairs and the 90 % ellipses."""
     d, places = picture.positions_m.shape[1], picture.positions_m[:, :2]
     for i, j in picture.pairs.tolist():
         axes.plot(*places[[i, j]].T, color=GRID, linewidth=0.8, zorder=1)
@@ -208,7 +208,7 @@ _TRUTH, _PATH, _MAP, _RECKONED = "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8"
 def draw_slam(
     run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, camera_field_rad: float, out: Path, title: str
 ) -> None:
-    """Draw a track, laid on the truth if there is one."""
+    """Draw a track, aligned with the truth if there is one."""
     beacons = {
         name: (np.array((fix.x_m, fix.y_m)), ellipse_outline(fix.covariance, SIGMAS))
         for name, fix in aligned_beacons(track, judged.alignment).items()
@@ -219,8 +219,8 @@ def draw_slam(
     points = np.vstack([path, surveyed, *(place + outline for place, outline in beacons.values())])
     low, high = points.min(axis=0), points.max(axis=0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low) + 0.06 * float((high - low).max()) + 1e-3
-    half[0] = max(half[0], half[1] / 1.1)  # no picture is much taller than wide,
-    half[1] = max(half[1], half[0] * 0.35)  # nor a stripe
+    half[0] = max(half[0], half[1] / 1.1)  # limits the aspect ratio of the picture
+    half[1] = max(half[1], half[0] * 0.35)
     known = bool(np.isfinite(judged.errors_m).any())
     residuals_m = range_residuals(run, track, camera_field_rad)
     has_residuals = bool(np.isfinite(residuals_m).any())

@@ -1,4 +1,4 @@
-"""A recorded mission among beacons as its report needs it, its reader, and its errors against the truth."""
+"""Data of a recorded mission among beacons for its report, their reader, and the errors against the truth."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ def standing_beacons(cfg: RadioConfig, message: BeaconMapMessage) -> dict[str, B
 
 
 def expected_rms_m(beacons: Mapping[str, BeaconEllipse]) -> float | None:
-    """Root of the mean square of a place's error that the filter expects, sqrt(mean(xx + yy)); None without beacons."""
+    """Root mean square position error of the beacons by the filter, sqrt(mean(xx + yy)), m; None without beacons."""
     if not beacons:
         return None
     total = sum(xx + yy for _, _, xx, _, yy in beacons.values())
@@ -47,7 +47,7 @@ def expected_rms_m(beacons: Mapping[str, BeaconEllipse]) -> float | None:
 
 
 def true_rms_m(beacons: Mapping[str, BeaconEllipse], places: Mapping[str, tuple[float, float]]) -> float | None:
-    """Root of the mean square distance of the beacons from their true places; None where none is known."""
+    """Root mean square distance of the beacons from their true places, m; None if no true place is known."""
     squares = [
         (x - places[name][0]) ** 2 + (y - places[name][1]) ** 2
         for name, (x, y, *_) in beacons.items()
@@ -58,7 +58,7 @@ def true_rms_m(beacons: Mapping[str, BeaconEllipse], places: Mapping[str, tuple[
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BeaconRecord(RunFiles):
-    """A mission among beacons; the truth is that of the same frames, NaN where there is none, None on a real robot."""
+    """A mission among beacons. The truth has the frames of the track: NaN where it is missing, None on a real robot."""
 
     version: str
     cfg: RadioConfig
@@ -76,12 +76,12 @@ class BeaconRecord(RunFiles):
 
     @property
     def settled_s(self) -> float:
-        """Robot time from which on the pose counts: a robot whose motes map themselves stands until then."""
+        """Robot time after which the pose is evaluated: a robot whose motes map themselves stands until then."""
         return self.maps[-1].notes.get("map_time_s", 0.0) if self.maps else 0.0
 
 
 def read_beacon_record(run_dir: Path) -> BeaconRecord:
-    """Everything that a report shows of a mission among beacons; ConfigError: its configuration cannot be used."""
+    """Read the data for the report of a mission among beacons; ConfigError: its configuration cannot be used."""
     cfg = load_radio_config(run_dir / CONFIG)
     shipped = load_radio_config(None, {"system": cfg.system})
     folder = RunFolder(run_dir, "log of the processes")
@@ -106,14 +106,14 @@ def read_beacon_record(run_dir: Path) -> BeaconRecord:
 
 
 def pose_errors_m(record: BeaconRecord) -> FloatArray | None:
-    """Distance of the estimated place from the true one, shape (k,); None where the truth is not known."""
+    """Distance of the estimated place from the true one, shape (k,); None if the truth is not known."""
     if record.truth is None:
         return None
     return np.asarray(np.hypot(*(record.track.place_m - record.truth.place_m).T))
 
 
 def pose_nees(record: BeaconRecord) -> FloatArray | None:
-    """e^T P^-1 e of x, y and heading, shape (k,); 3 is expected. None where the truth is not known."""
+    """NEES e^T P^-1 e of x, y and heading, shape (k,), with the expectation 3; None if the truth is not known."""
     if record.truth is None:
         return None
     return nees(pose_errors(record.track, record.truth), record.track.covariance)
@@ -128,14 +128,14 @@ class Reading(NamedTuple):
 
 
 def readings_of(record: BeaconRecord) -> list[Reading]:
-    """How the readings agreed with what was expected of them, from map to map."""
+    """NIS of the readings from map to map."""
     pairs = zip(record.maps, record.maps[1:], strict=False)
     found = [Reading(later.t_s, later.nis_sum - one.nis_sum, later.nis_size - one.nis_size) for one, later in pairs]
     return [reading for reading in found if reading.size > 0]
 
 
 class WaypointRow(NamedTuple):
-    """A waypoint that was reached; None is not known without a truth."""
+    """A waypoint that was reached; None if the truth is not known."""
 
     number: int  # over all laps, from 1
     lap: int  # from 1
@@ -144,7 +144,7 @@ class WaypointRow(NamedTuple):
     place_m: tuple[float, float]
     sigma_m: float
     estimate_off_m: float
-    true_off_m: float | None  # of the true place
+    true_off_m: float | None  # distance of the true place from the waypoint
     error_m: float | None  # distance of the estimated place from the true one
     sigmas: float | None  # the same in standard deviations, root(e^T P^-1 e)
 
@@ -178,7 +178,7 @@ class BeaconRow(NamedTuple):
 
 
 def beacon_rows(record: BeaconRecord) -> list[BeaconRow]:
-    """The beacons that stand, by name."""
+    """The stationary beacons, by name."""
     judged = beacon_errors(record.beacons, record.places)
     return [
         BeaconRow(name, (x, y), worst_sigma_m(*ellipse), *judged.get(name, (None, None)))

@@ -26,17 +26,17 @@ FALSE_ALARM = 0.01  # probability that noise alone makes any panel of the mirror
 
 
 class PanelChange(NamedTuple):
-    """One panel, the later survey less the earlier one."""
+    """Change of one panel: values of the later survey minus those of the earlier one."""
 
     panel: PanelId
     values: FloatArray  # piston (m), tip, tilt (rad), shape (3,)
     sigma: FloatArray  # standard deviations of these
-    chi2: float  # of no change at all, three degrees of freedom
-    has_moved: bool  # noise alone would hardly make it so
+    chi2: float  # of the hypothesis of no change, three degrees of freedom
+    has_moved: bool  # the change is not explained by noise, see ``FALSE_ALARM``
 
 
 class Changes(NamedTuple):
-    """All panels that both surveys determined, the chi-square of no change, and the band noise alone keeps it in."""
+    """All panels that both surveys determined, chi^2 of the hypothesis of no change, and its interval under noise."""
 
     panels: tuple[PanelChange, ...]
     chi2: float
@@ -46,12 +46,12 @@ class Changes(NamedTuple):
 
     @property
     def agree(self) -> bool:
-        """Nothing but noise is between the surveys."""
+        """Whether the surveys differ by no more than noise."""
         return self.chi2 <= self.high and not any(panel.has_moved for panel in self.panels)
 
 
 def panel_changes(pairs: Sequence[tuple[PanelResult, PanelResult]]) -> Changes | None:
-    """Compare the panels of two surveys of one mirror; None without any. With another puck all seem to move."""
+    """Compare the panels of two surveys of one mirror; None without panels. Another puck looks like a move of all."""
     if not pairs:
         return None
     changes = []
@@ -67,10 +67,10 @@ def panel_changes(pairs: Sequence[tuple[PanelResult, PanelResult]]) -> Changes |
 
 
 class RunPair:
-    """Two runs, called A and B as on the page, and what changed between them on one mirror.
+    """Two runs, called A and B as on the page, and the changes between them.
 
-    ``panels``: those of each that could be fitted; ``wavefronts``: half-wavefront errors of the panels that both have,
-    None where there are none. Only of one mirror points and panels are compared, else ``warning`` says why not.
+    ``panels``: the fitted panels of each run; ``wavefronts``: half-wavefront errors of the panels that both runs have,
+    or None. Points and panels are compared only if the mirror is the same; otherwise ``warning`` is not empty.
     """
 
     def __init__(self, a: Findings, b: Findings) -> None:
@@ -91,7 +91,7 @@ class RunPair:
 
 
 def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> RunPair:
-    """Write two runs beside each other, and their figures if a directory is given; raises as ``report_run``."""
+    """Write a page that compares two runs, and its figures if a directory is given; raises as ``report_run``."""
     if figures is not None:
         check_drawing(figures)
     pair = RunPair(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
@@ -102,13 +102,13 @@ def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = Non
 
 
 class ComparedValue(NamedTuple):
-    """One value of both runs: its name with its unit, the decimals it is written with, and the values."""
+    """One value of both runs: name with unit, number of decimals, values."""
 
     name: str
     decimals: int
     a: float | None
     b: float | None
-    change: float | None  # B less A, as far as the decimals go
+    change: float | None  # B minus A, rounded to the decimals
 
 
 # Path of a value in ``run_data``, its name, its decimals.
@@ -142,9 +142,9 @@ _WAVEFRONT_ROWS: tuple[_Row, ...] = (
 
 
 def compared_figures(pair: RunPair) -> list[ComparedValue]:
-    """The figures of both runs; those that neither knows are left out.
+    """The values of both runs; values that neither run has are left out.
 
-    Half-wavefront errors are of the panels that both have, and their names say so where these are not all.
+    Half-wavefront errors are those of the panels that both runs have; the names state this if these are not all panels.
     """
     data = [run_data(found) for _, found in pair.named]
     a, b = pair.panels
@@ -172,7 +172,7 @@ def _compared(
 
 
 def compare_page(pair: RunPair) -> str:
-    """The comparison as one HTML file. A section that the runs hold nothing for is left out."""
+    """The comparison as one HTML file. A section without data is left out."""
     mirror, (a, b) = pair.b.record.mirror, pair.panels
     ours, others = (found.record.cfg.model_dump(mode="json") for _, found in pair.named)
     earlier = {verdict.point: verdict for verdict in pair.a.points}
@@ -199,7 +199,7 @@ def compare_page(pair: RunPair) -> str:
 
 
 def compare_drawings(pair: RunPair) -> dict[str, Draw]:
-    """What draws each figure, by the names of their files; those that neither run holds anything for are left out."""
+    """Functions that draw the figures, by file name; figures without data are left out."""
     found: dict[str, Draw] = {}
     budgets = [(name, one.budget) for name, one in pair.named if one.budget is not None]
     if budgets:
@@ -221,7 +221,7 @@ def compare_drawings(pair: RunPair) -> dict[str, Draw]:
 
 
 def compare_lines(pair: RunPair) -> list[str]:
-    """A line for each figure that differs, then the panels that have moved."""
+    """A line for each value that differs, then the panels that have moved."""
     rows = [one for one in compared_figures(pair) if one.change != 0.0]
     names = [one.name.replace("\u00b5", "u").replace("\u03c3", "sigma") for one in rows]
     width = max(map(len, names), default=0) + 2
@@ -229,7 +229,7 @@ def compare_lines(pair: RunPair) -> list[str]:
 
 
 def compare_data(pair: RunPair) -> dict[str, Any]:
-    """What ``ccatp compare --json`` prints."""
+    """Output of ``ccatp compare --json``."""
     changes, (a, b) = pair.changes, map(wavefront_data, pair.wavefronts)
     return {
         "a": run_data(pair.a),

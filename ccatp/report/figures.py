@@ -17,8 +17,8 @@ from ccatp.report.findings import KINDS, ErrorSeries, TimeBreakdown
 from ccatp.report.plots import BAD, INK, PX_PER_IN, QUIET, SERIES, add_legend, ellipse_outline, envelope, is_wide
 from ccatp.report.record import WITHIN_MM
 
-_LEAST_MM = 1e-3  # a micrometre: less is of no interest, and of the noise of the laser
-_PX_PER_INTERVAL = 0.5  # of series over time: there is more to see when a figure is zoomed
+_LEAST_MM = 1e-3  # smaller errors are below the noise of the laser
+_PX_PER_INTERVAL = 0.5  # of series over time; finer than a pixel for zoomed figures
 _OF_THE_BUDGET = 0.4  # a few panels are no matter of an hour
 _KIND_COLOURS = dict(
     zip(KINDS, (SERIES[1], SERIES[0], SERIES[5], SERIES[2], SERIES[4], SERIES[3], "#6b5b95", QUIET), strict=True)
@@ -26,7 +26,7 @@ _KIND_COLOURS = dict(
 
 
 def error_figure(series: ErrorSeries, width_px: float) -> Figure:
-    """Localization error, if known, three sigma, and how far each fix moved the estimate, over time; mm."""
+    """Localization error (if known), three sigma, and the change of the estimate by each fix, over time; mm."""
     axes = plots.new_plot(width_px, "localization error over time", log="y")
     errors = series.error_mm[np.isfinite(series.error_mm)]
     usual_mm = float(np.percentile(errors, 2)) if len(errors) else 0.1
@@ -41,7 +41,7 @@ def error_figure(series: ErrorSeries, width_px: float) -> Figure:
         found = envelope(series.t_s / 60.0, values_mm, max(1, int(width_px / _PX_PER_INTERVAL)))
         if not len(found.x):
             continue
-        # From the least to the largest of each interval; parted where there is nothing for a long time.
+        # The band from the smallest to the largest value of each interval, with a break at long gaps.
         steps = np.diff(found.x)
         gaps = 1 + np.flatnonzero(steps > 10.0 * np.median(steps)) if len(steps) else np.empty(0, dtype=np.int64)
         x, least, largest = (np.insert(values, gaps, np.nan) for values in found[:3])
@@ -61,7 +61,7 @@ def error_figure(series: ErrorSeries, width_px: float) -> Figure:
 
 
 def time_figure(budgets: Sequence[tuple[str, TimeBreakdown]], budget_s: float, width_px: float) -> Figure:
-    """Where the time of runs went, each above the least that its way takes; marked is what a mission may take."""
+    """Bars of the times of each run by kind, each above the least times of the same way; a line marks the budget."""
     bars: list[tuple[str, dict[str, float]]] = []
     for name, found in budgets:
         bars += [(name, found.spent_s), *([("least", found.least_s)] if found.least_s is not None else [])]
@@ -75,7 +75,7 @@ def time_figure(budgets: Sequence[tuple[str, TimeBreakdown]], budget_s: float, w
             continue
         lengths_s = np.array([parts.get(kind, 0.0) for _, parts in bars])
         drawn = axes.barh(range(len(bars)), lengths_s, 0.75, left_s, color=_KIND_COLOURS[kind], label=kind)
-        least_px = 9.0 * (end_s / width_px)  # a digit
+        least_px = 9.0 * (end_s / width_px)  # width of a digit, s
         texts = [f"{length:.0f}" if length > least_px * (len(f"{length:.0f}") + 1) else "" for length in lengths_s]
         axes.bar_label(drawn, texts, label_type="center", color=plots.PAPER, fontsize=8)
         left_s += lengths_s
@@ -91,7 +91,7 @@ def time_figure(budgets: Sequence[tuple[str, TimeBreakdown]], budget_s: float, w
 
 
 def distribution_figure(values: Mapping[str, FloatArray], label: str, width_px: float) -> Figure:
-    """Share of the values of each run below each number, logarithmic; ``label`` names them with their unit."""
+    """Cumulative distribution of the values of each run, logarithmic axis; ``label``: name with unit."""
     axes = plots.new_plot(width_px, f"distribution of {label}", (330.0, 300.0), log="x")
     everything = np.maximum(np.concatenate(list(values.values())), _LEAST_MM)
     low, high = 10.0 ** np.floor(np.log10(everything.min())), 10.0 ** np.ceil(np.log10(everything.max() * 1.001))
@@ -124,11 +124,11 @@ def errors_figure(series: Mapping[str, ErrorSeries], width_px: float) -> Figure:
 
 SIGMAS = 3.0
 _POSE_STATES = 3
-_TOP = 6.0  # of the figure of consistency: what lies above is drawn at its edge
+_TOP = 6.0  # of the figure of consistency; larger values are drawn at its edge
 _HEIGHTS_PX = (340.0, 300.0)
-_MARGIN_M, _BEYOND_M = 0.25, 1.5  # around the room; of it what stands outside is still shown
+_MARGIN_M, _BEYOND_M = 0.25, 1.5  # around the room; largest distance outside the room that is shown
 _ELLIPSES = 14  # along the path
-_TALL = 0.95  # most height for the width
+_TALL = 0.95  # largest ratio of height to width
 _TARGET = BAD
 
 
@@ -154,12 +154,12 @@ def beacon_error_figure(record: BeaconRecord, width_px: float) -> Figure:
 
 
 def standing_maps(record: BeaconRecord) -> list[tuple[float, dict[str, BeaconEllipse]]]:
-    """Robot time (s) and beacons of each map that holds any."""
+    """Robot time (s) and beacons of each map that has beacons."""
     return [(one.t_s, beacons) for one in record.maps if (beacons := beacon_record.standing_beacons(record.cfg, one))]
 
 
 def map_error_figure(record: BeaconRecord, width_px: float) -> Figure:
-    """Root of the mean square error of the beacons, expected and true, against time."""
+    """Root mean square error of the beacons, expected and true, against time."""
     maps = standing_maps(record)
     rows = [
         (t_s, beacon_record.expected_rms_m(beacons), beacon_record.true_rms_m(beacons, record.places))
@@ -173,7 +173,7 @@ def map_error_figure(record: BeaconRecord, width_px: float) -> Figure:
 
 
 def consistency_figure(record: BeaconRecord, width_px: float) -> Figure:
-    """NIS of the readings and NEES of the pose, each by its degrees of freedom: 1 is expected."""
+    """NIS of the readings and NEES of the pose, each divided by its degrees of freedom: 1 is expected."""
     readings, nees = beacon_record.readings_of(record), beacon_record.pose_nees(record)
     axes = plots.new_plot(width_px, "consistency over time", _HEIGHTS_PX)
     axes.axhline(1.0, color=QUIET, linewidth=1.0, linestyle="--")
@@ -192,7 +192,7 @@ def consistency_figure(record: BeaconRecord, width_px: float) -> Figure:
 
 
 def target_figure(record: BeaconRecord, width_px: float) -> Figure:
-    """Distance to the followed radio, by the estimate and in truth."""
+    """Distance to the followed radio, estimated and true."""
     curves, safe_m = target_curves(record), record.cfg.follow.safe_distance_m
     axes = plots.new_plot(width_px, "distance to the target over time", _HEIGHTS_PX)
     _draw_curves(axes, curves, width_px)
@@ -203,7 +203,7 @@ def target_figure(record: BeaconRecord, width_px: float) -> Figure:
 
 
 def target_curves(record: BeaconRecord) -> list[Curve]:
-    """Distance to the followed radio; empty where none is followed."""
+    """Distance to the followed radio; empty if no radio is followed."""
     curves = []
     if record.cfg.follow.is_active and record.truth is not None:
         off = np.hypot(*(record.truth.target_m - record.truth.place_m).T)

@@ -1,4 +1,4 @@
-"""What follows from a recorded survey, computed once for page, figures and data: points, errors, times, alignment."""
+"""Results of a recorded survey, computed once for page, figures and data: points, errors, times, alignment."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -29,24 +29,24 @@ SIGMAS = 3.0
 
 
 class Grade(StrEnum):
-    """How a point ended."""
+    """Result of a point."""
 
     GOOD = "pass"  # measured, and within 10 mm at the first arrival
     CORRECTED = "corrected"  # measured within 10 mm, after a correction
-    FAIL = "fail"  # measured where the robot was further away than that
+    FAIL = "fail"  # measured at a distance of more than 10 mm
     SKIPPED = "skipped"
     OPEN = "not measured"
 
 
 class PointVerdict(NamedTuple):
-    """One measurement point; None is not known."""
+    """One measurement point; None if not known."""
 
     point: PointId
     place_m: tuple[float, float]  # deck x, y
     first_mm: float | None  # distance at the first arrival, before any correction
-    left_mm: float | None  # distance where it was measured, as the laser saw it
+    left_mm: float | None  # distance at the measurement, by the laser
     grade: Grade
-    why: str  # why it was left out; may be empty
+    why: str  # reason why it was skipped; may be empty
 
     @property
     def shown_mm(self) -> float | None:
@@ -60,7 +60,7 @@ class PointVerdict(NamedTuple):
 
 
 def point_verdicts(record: RunRecord) -> list[PointVerdict]:
-    """Every point of the mission, by row, column and number; empty where the run holds no mission."""
+    """Every point of the mission, by row, column and number; empty if the run has no mission."""
     first, reasons = first_arrivals_mm(record), _reasons(record)
     mirror, height_m = record.mirror, record.cfg.robot.puck_height_m
     left = {
@@ -74,7 +74,7 @@ def point_verdicts(record: RunRecord) -> list[PointVerdict]:
         elif left_mm > WITHIN_MM:
             grade = Grade.FAIL
         else:
-            # Where the first arrival is not known the fix has to do.
+            # If the first arrival is not known, the fix is used.
             grade = Grade.GOOD if (left_mm if first_mm is None else first_mm) <= WITHIN_MM else Grade.CORRECTED
         place_m = mirror.point_on_deck(row.point)
         found.append(PointVerdict(row.point, place_m, first_mm, left_mm, grade, reasons.get(row.point, "")))
@@ -82,7 +82,7 @@ def point_verdicts(record: RunRecord) -> list[PointVerdict]:
 
 
 def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
-    """Distance from each point at the first rest there, mm: from the truth, or from the first fix there."""
+    """Distance from each point at the first rest there, mm, by the truth or by the first fix there."""
     found: dict[PointId, float] = {}
     mirror, height_m = record.mirror, record.cfg.robot.puck_height_m
     for session in record.sessions:
@@ -119,19 +119,19 @@ def _reasons(record: RunRecord) -> dict[PointId, str]:
 
 
 class ErrorSeries(NamedTuple):
-    """Over the time of all sessions, one after the other; of frames shape (k,), of fixes shape (n,)."""
+    """Errors against the time of all sessions, one after the other; frames have shape (k,), fixes (n,)."""
 
     t_s: FloatArray  # robot time since the start of the first session
     sigma3_mm: FloatArray  # three standard deviations of the estimated place
-    error_mm: FloatArray  # distance of the true place from the estimated one; NaN where the truth is not known
+    error_mm: FloatArray  # distance of the true place from the estimated one; NaN if the truth is not known
     breaks_s: tuple[float, ...]
     fix_t_s: FloatArray
-    fix_mm: FloatArray  # how far each moved the estimate, or would have
+    fix_mm: FloatArray  # change of the estimate by each fix, also if the fix was not fused
     fix_fused: "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]"
 
 
 def error_series(record: RunRecord) -> ErrorSeries | None:
-    """The series; None without an estimate."""
+    """The errors of a run; None without an estimate."""
     sessions = [session for session in record.sessions if len(session.track.seq)]
     if not sessions:
         return None
@@ -180,20 +180,20 @@ def error_figures(series: ErrorSeries) -> dict[str, float] | None:
 
 
 class Quality(NamedTuple):
-    """How good the measurement was; None is not known."""
+    """Quality of the measurement; None if not known."""
 
     fixes: int  # in the recordings
-    refused: int  # of them: doubted, or of no use
-    lengths_um: FloatArray  # rms of the residuals of the lengths, of each fix that counts
-    plane: Consistency | None  # chi-square of the fitted panels by its degrees of freedom
+    refused: int  # of them: doubted or not usable
+    lengths_um: FloatArray  # rms of the length residuals of each fix that counts
+    plane: Consistency | None  # chi^2 of the fitted panels, divided by its degrees of freedom
     plane_rms_um: float | None  # of the residuals of their planes
     repeats: int  # measurements of a point beyond its first one
-    repeat_um: float | None  # standard deviation of one deviation, from points that were measured more than once
-    nis: Consistency | None  # of the place that each fix shows against the estimate before it
+    repeat_um: float | None  # standard deviation of one deviation, from points measured more than once
+    nis: Consistency | None  # of the position of each fix against the estimate before it
 
 
 def quality_of(record: RunRecord, alignment: SurveyResult | None) -> Quality:
-    """Residuals, repeatability and NIS: 1 or less of a consistent filter, as the recorded sigma is the worst one."""
+    """Residuals, repeatability, NIS. A consistent filter has NIS <= 1, because the recorded sigma is the largest."""
     panels = () if alignment is None else alignment.panels
     chi2, dof = np.array([(panel.model.chi2, panel.model.dof) for panel in panels]).reshape(-1, 2).T
     recorded = [(session, fix) for session in record.sessions for fix in session.fixes]
@@ -232,18 +232,18 @@ _KIND_OF = {
 }  # fmt: skip
 _OVER = "done"
 _NEVER_BEGUN = "idle"
-_ROUNDING_S = 1e-3  # of a status; a frame takes ten times as long
+_ROUNDING_S = 1e-3  # of times in a status; a tenth of a frame
 
-TimeSpan = tuple[str, float]  # a state of the mission, and for how long, s
+TimeSpan = tuple[str, float]  # a state of the mission and its duration, s
 
 
 class TimeBreakdown(NamedTuple):
     """Times of a run by kind, s."""
 
-    spent_s: dict[str, float]  # in the order of KINDS; those that did not occur are left out
-    least_s: dict[str, float] | None  # of the same way from rest to rest; None where the way is not known
+    spent_s: dict[str, float]  # in the order of KINDS; kinds that did not occur are left out
+    least_s: dict[str, float] | None  # of the same way from rest to rest; None if the way is not known
     visits: dict[str, int]  # how often the robot turned, drove, settled, measured, ...
-    is_exact: bool  # from the log, frame by frame; else sampled from the status
+    is_exact: bool  # to a frame, from the log; otherwise sampled from the status
     covers: str
 
     @property
@@ -258,7 +258,7 @@ class TimeBreakdown(NamedTuple):
 
 
 def time_budget(record: RunRecord) -> TimeBreakdown | None:
-    """The budget of a run; None where its states are not recorded. A longer measurement than is due waited."""
+    """Times of a run; None if its states are not recorded. Measuring beyond the configured time counts as waiting."""
     measuring_s = record.cfg.etalon.measuring_time_s
     found = [spells_of(session) for session in record.sessions]
     spent, visits = defaultdict[str, float](float), defaultdict[str, int](int)
@@ -271,20 +271,20 @@ def time_budget(record: RunRecord) -> TimeBreakdown | None:
     if not spent:
         return None
     least, covers = least_times(record)
-    # Sums of a hundredth of a second do not come out at 0.
+    # Sums of hundredths of a second have rounding errors.
     kinds = [kind for kind in KINDS if spent[kind] > 1e-6]
     by_kind, counts = {kind: spent[kind] for kind in kinds}, {kind: visits[kind] for kind in kinds}
     return TimeBreakdown(by_kind, least, counts, all(is_exact for _, is_exact in found), covers)
 
 
 def spells_of(session: RecordedSession) -> tuple[list[TimeSpan], bool]:
-    """Spells of one state, and whether they are exact: between the changes in the log, else as the status shows them.
+    """States with durations, and whether these are exact: from the changes in the log, otherwise from the status.
 
-    The last state of a main loop that died is not logged; the time until the first status of its successor counts as
-    waiting, but for that in which there was none.
+    The last state of a main loop that died is not logged. The time until the first status of the next main loop counts
+    as waiting, except for the time without a main loop, which counts as a restart.
     """
     spells: list[TimeSpan] = []
-    absent_s = 0.0  # robot time that no mission counted: main was restarted
+    absent_s = 0.0  # robot time without mission time: the main loop was restarted
     for one, later in pairwise(status for status in session.statuses if status.seq >= 0):
         passed_s = later.t_s - one.t_s
         missing_s = passed_s - (later.elapsed_s - one.elapsed_s)
@@ -299,7 +299,7 @@ def spells_of(session: RecordedSession) -> tuple[list[TimeSpan], bool]:
         states = [*(change.before for change in session.changes), session.changes[-1].after]
         spells = [(state, end - start) for state, (start, end) in zip(states, pairwise(times), strict=True)]
         restarts = [index for index, state in enumerate(states) if index and state == _NEVER_BEGUN]
-        # What its predecessor did last was not written down in time, so that it is not counted either.
+        # The log lacks the last state before a restart, so the time without a main loop is taken from that span, too.
         for index in (place for last in restarts for place in (last, last - 1)):
             state, duration_s = spells[index]
             part_s = min(duration_s, absent_s)
@@ -310,10 +310,10 @@ def spells_of(session: RecordedSession) -> tuple[list[TimeSpan], bool]:
 
 
 def least_times(record: RunRecord) -> tuple[dict[str, float] | None, str]:
-    """Least times of the planned way, up to the last point that was measured, and what that covers.
+    """Least times of the planned way up to the last measured point, and the covered part as text.
 
-    Bang-bang times from rest to rest, turning in place at every stop (``ccatp.survey.planning.search``), as
-    ``lower_bound_s`` of ``summary.json``, which is their sum for a mission that is complete and was not resumed.
+    These are bang-bang times from rest to rest with a turn in place at every stop (``ccatp.survey.planning.search``).
+    Their sum is ``lower_bound_s`` of ``summary.json`` for a complete mission that was not resumed.
     """
     cfg, mirror = record.cfg, record.mirror
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
@@ -338,7 +338,7 @@ def least_times(record: RunRecord) -> tuple[dict[str, float] | None, str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
-    """A run and what follows from it. What the run does not hold is None or empty."""
+    """A run and its results; parts that the run lacks are None or empty."""
 
     record: RunRecord
     outcome: PointOutcome
@@ -352,12 +352,12 @@ class Findings:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is damaged in the run, and doubtful in its alignment."""
+        """Damaged parts of the run, and doubtful results of its alignment."""
         return self.record.warnings + (self.alignment.warnings if self.alignment is not None else ())
 
 
 def findings_of(record: RunRecord) -> Findings:
-    """Everything that follows from a recorded run."""
+    """Compute the results of a recorded run."""
     errors, cfg = error_series(record), record.cfg
     alignment = against = None
     if record.measured:
@@ -371,14 +371,14 @@ def findings_of(record: RunRecord) -> Findings:
 
 
 def observation_of(record: RunRecord) -> dict[str, str]:
-    """When (UTC), where, by whom and with which instruments; what is not known, or was not given, is left out."""
+    """Time (UTC), place, observer and instruments; unknown values are left out."""
     date = {"date_obs": record.log[0].wall, "date_end": record.log[-1].wall} if record.log else {}
     values = {**date, "mirror": record.mirror.name, **record.cfg.observation.model_dump()}
     return {name: value for name, value in values.items() if value}
 
 
 def metadata_of(found: Findings) -> dict[str, object]:
-    """What each table says of its survey; what is not known is left out."""
+    """Metadata of the survey in each table; unknown values are left out."""
     record, wavefront = found.record, found.alignment and found.alignment.wavefront
     values = {
         "run": record.name,
@@ -397,7 +397,7 @@ def metadata_of(found: Findings) -> dict[str, object]:
 
 
 def coverage_of(found: Findings) -> dict[str, int]:
-    """How much of the mirror, and of the plan, was measured."""
+    """Measured share of the mirror and of the plan."""
     panels = len(found.record.mirror.panels)
     return {
         "panels_determined": 0 if found.alignment is None else len(found.alignment.panels),
@@ -408,12 +408,12 @@ def coverage_of(found: Findings) -> dict[str, int]:
     }
 
 
-# What the supervisor logs at the end of a complete mission.
+# Log line of the supervisor at the end of a complete mission.
 _FINISHED = "run finished: status 0"
 
 
 def outcome_of(record: RunRecord) -> PointOutcome:
-    """How the run ended, by the last status, else by the log; a run without an end goes on or was killed."""
+    """Outcome of the run by the last status, otherwise by the log; without both it is running or was killed."""
     status = record.last_status
     if status is not None and status.outcome:
         return PointOutcome(status.outcome, status.cause, is_good=status.outcome == COMPLETE)

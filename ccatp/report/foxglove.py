@@ -90,7 +90,7 @@ CHORDS = 8
 
 
 def panel_scene(mirror: Mirror, timestamp: Any) -> Any:
-    """Every panel's outline and label, and the rim, deck frame."""
+    """Outline and label of every panel, and the rim, deck frame."""
 
     def outline(places: Iterable[Sequence[float]], pixels: float, colour: Any) -> Any:
         return LinePrimitive(LOOP, ORIGIN, pixels, True, [_on_surface(mirror, x, y) for x, y in places], colour)
@@ -211,7 +211,7 @@ ErrorView = _message(
 
 
 class TopicView(NamedTuple):
-    """A row of the table of views; the last message of a latched one holds until the next."""
+    """A row of the table of views; the last message of a latched view is valid until the next one."""
 
     name: str
     message: Any
@@ -253,7 +253,7 @@ class Views:
     def __init__(self, mirror: Mirror, puck_height_m: float, clock: RobotClock) -> None:
         self._mirror, self._puck_height_m, self._utc_ns = mirror, puck_height_m, clock.utc_ns
         self._deviations_m: dict[PointId, float] = {}
-        # Of one frame either may arrive first; at most _KEPT wait for their counterpart.
+        # Estimate and truth of a frame arrive in any order; at most _KEPT wait for their counterpart.
         self._estimates: dict[int, DeckPose] = {}
         self._truths: dict[int, DeckPose] = {}
         self._points_sent_s = 0.0
@@ -370,7 +370,7 @@ def _shown(topic: str, t_s: float, message: object) -> RecordedMessage:
 
 # -- live streams: PlotJuggler's framing over ZeroMQ, Foxglove's WebSocket; times of their messages are UTC ------------
 
-# Some seconds of a run at full speed; a slower viewer loses the newest messages.
+# Enough for some seconds of a run; a slower viewer loses the newest messages.
 HIGH_WATER_MARK = 5000
 LINGER_MS = 200
 
@@ -431,7 +431,7 @@ class FoxgloveStream:
             from foxglove.websocket import ServerListener  # noqa: PLC0415
         except ImportError as error:
             raise StreamError("Foxglove needs its SDK: install ccatp with its extra, ccatp[foxglove]") from error
-        # The server calls from a thread of its own.
+        # The server calls this from its own thread.
         subscribed: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._subscribed = subscribed
 

@@ -1,4 +1,4 @@
-"""What all pages share: templates, numbers as text, figures in two layouts, files, lines of the log."""
+"""Common parts of all pages: templates, numbers as text, figures in two layouts, files, log lines."""
 
 import re
 from base64 import b64encode
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 DASH = "\u2013"
 MICRO = 1e6
 SCRIPT = (Path(__file__).parent / "templates" / "zoom.js").read_text(encoding="utf-8")
-# Nothing is loaded, sent or embedded, and nothing but this script is run; what the page shows stands in it.
+# The page contains all its data: it loads, sends and embeds nothing, and runs only this script.
 POLICY = (
     f"default-src 'none'; script-src 'sha256-{b64encode(sha256(SCRIPT.encode()).digest()).decode()}'; "
     "style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 )
-_FEW_LINES = 40  # more notable lines than these are shown by their kinds
+_FEW_LINES = 40  # a larger number of notable lines is shown by kinds
 _KINDS, _LINES_AT_AN_END = 100, 200
 _MOST_ROWS = 100  # of a list whose length a damaged run determines
 _BEGIN = "run started"  # more than once: the run was resumed
 _STATISTICS = ("gate statistics", "reading statistics")
 _OVER = LogLine("", None, "info", "", "The mission is over: the processes close their connections and end.")
 _CALM = ("info", "debug")
-# What no reader may miss, at whatever level it was logged.
+# Lines that are always shown, independent of their log level.
 _GRAVE = re.compile(
     r"(?i)\banew\b|restarted|\babort|emergenc|was killed|\bdied\b|link lost|returning to base|interrupted"
 )
@@ -45,7 +45,7 @@ Draw = Callable[[float], "Figure"]
 
 
 def page_figures(drawings: Mapping[str, Draw]) -> dict[str, tuple[Markup, Markup]]:
-    """Each picture in two layouts, for a screen and for a phone; the page shows one of them."""
+    """Each figure in two layouts, for a screen and for a phone; the page shows one of them."""
     return {name: (inline(draw(WIDE)), inline(draw(NARROW))) for name, draw in drawings.items()}
 
 
@@ -55,7 +55,7 @@ def inline(figure: "Figure") -> Markup:
 
 
 def render(template: str, **values: Any) -> str:
-    """The page as one HTML file that needs nothing from outside."""
+    """The page as one HTML file without external resources."""
     return environment().get_template(template).render(values)
 
 
@@ -72,7 +72,7 @@ def environment() -> Environment:
 
 
 def number_text(value: float | str | None, decimals: int = 2) -> str:
-    """A number of a page: a dash for what is not known, a typographic minus, never a negative zero."""
+    """A number as text: a dash if it is not known, a typographic minus, no negative zero."""
     if value is None:
         return DASH
     if not isinstance(value, float):
@@ -107,19 +107,19 @@ def write_pictures(drawings: dict[str, Draw], folder: Path) -> None:
 
 
 class Gathered(NamedTuple):
-    """Lines that differ in their numbers alone: their common text, and all of them."""
+    """Lines that differ only in their numbers, and their common text."""
 
     text: str
     lines: tuple[LogLine, ...]
-    rank: int  # 0 errors, 1 what no reader may miss, 2 warnings, 3 the rest
+    rank: int  # 0 errors, 1 lines that are always shown, 2 warnings, 3 the rest
 
 
 class Events(NamedTuple):
-    """What the page shows of a log."""
+    """The parts of a log that the page shows."""
 
     total: int
-    notable: Sequence[LogLine]  # warnings, errors and what else no reader may miss
-    kinds: Sequence[Gathered]  # in place of many notable lines, the gravest and then the rarest first
+    notable: Sequence[LogLine]  # warnings, errors, and lines that are always shown
+    kinds: Sequence[Gathered]  # in place of many notable lines; the most severe, then the rarest first
     kinds_left_out: int
     first: Sequence[LogLine]  # at both ends
     last: Sequence[LogLine]
@@ -127,7 +127,7 @@ class Events(NamedTuple):
 
 
 def events_of(lines: Sequence[LogLine]) -> Events:
-    """What the page shows of a log: bounded, however long that is."""
+    """The parts of a log that the page shows; their number is limited."""
     found = [kind for kind in gathered(lines) if kind.rank < 3]
     notable = {id(line) for kind in found for line in kind.lines}
     kinds = sorted(found, key=lambda kind: (kind.rank, len(kind.lines))) if len(notable) > _FEW_LINES else []
@@ -148,15 +148,15 @@ def events_of(lines: Sequence[LogLine]) -> Events:
 
 
 def _end_of(lines: Sequence[LogLine]) -> int | None:
-    """Where main writes that its mission is over: connections that are closed after that are not lost."""
+    """Index of main's line that its mission is over; connections that close after it are not lost."""
     own = [at for at, line in enumerate(lines) if line.process == "main" and line.text.startswith(_STATISTICS)]
     return own[-1] if own and lines[-1].text.startswith("run finished") else None
 
 
 def gathered(lines: Iterable[LogLine]) -> list[Gathered]:
-    """Lines by process, level and text but for its numbers, in the order of their first.
+    """Lines grouped by process, level and text without numbers, in the order of the first line of each group.
 
-    The common text has each number that varies as the span of its values: the worst of them is one of its ends.
+    In the common text the range of the values replaces each number that varies.
     """
     kinds: dict[tuple[str, ...], list[LogLine]] = {}
     for line in lines:

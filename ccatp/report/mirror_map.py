@@ -1,4 +1,4 @@
-"""Maps of a mirror (deck frame, x to the right): a driven path with arrival errors, a plan, the surface of panels."""
+"""Maps of a mirror (deck frame, x to the right): driven path with arrival errors, plan, surface of the panels."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -29,7 +29,7 @@ ALIGN_WIDTH_PX, ALIGN_DPI = 2400, 200
 _MARGIN_M = 0.22  # around the mirror, for the numbers of rows and columns
 _MICRO = 1e6
 _CELLS_WIDE, _CELLS_NARROW = 12, 6  # along each side of a panel
-# A single far point must not make all others look alike.
+# One distant point must not give all others the same colour.
 _USUAL_ERRORS_PERCENT, _USUAL_HEIGHTS_PERCENT = 98.0, 99.0
 _ERROR_COLOURS, _TIME_COLOURS, _HEIGHT_COLOURS = (
     LinearSegmentedColormap.from_list(name, colours)
@@ -42,7 +42,7 @@ _ERROR_COLOURS, _TIME_COLOURS, _HEIGHT_COLOURS = (
 
 
 def new_mirror_map(mirror: Mirror, width_px: float, title: str, subtitle: str | None = None) -> Axes:
-    """The ground of a map: panels, their rows and columns, and the rim; both axes in metres, to the same scale.
+    """A map with the panels, their rows and columns, and the rim; both axes in metres, with the same scale.
 
     The title is written above the map if there is a subtitle, which may be empty.
     """
@@ -76,7 +76,7 @@ def new_mirror_map(mirror: Mirror, width_px: float, title: str, subtitle: str | 
 
 
 def _draw_base(axes: Axes, mirror: Mirror, width_px: float) -> None:
-    """Where the robot starts, and its heading."""
+    """Draw the start pose of the robot."""
     base = mirror.base_pose
     ahead = {"dx": 0.18 * cos(base.heading_rad), "dy": 0.18 * sin(base.heading_rad)}
     shape = {"width": 0.035, "head_width": 0.11, "head_length": 0.09, "length_includes_head": True}
@@ -86,7 +86,7 @@ def _draw_base(axes: Axes, mirror: Mirror, width_px: float) -> None:
 
 
 def _finished(axes: Axes, drawn: ScalarMappable, label: str, width_px: float, extend: str = "neither") -> Figure:
-    """With the legend, and what the colours mean beside the map or on a phone below it."""
+    """Add the legend and the colour bar, beside the map or (on a phone) below it."""
     place: dict[str, Any] = {"location": "bottom", "aspect": 30}
     if is_wide(width_px):
         place = {"location": "right", "shrink": 0.6, "aspect": 40}
@@ -106,9 +106,9 @@ def run_map(
     mirror: Mirror, path_m: FloatArray, verdicts: Sequence[PointVerdict], width_px: float, title: str,
     subtitle: str | None = None, path_label: str = "driven path", *, is_first: bool = False,
 ) -> Figure:  # fmt: skip
-    """The driven path (deck frame, shape (n, 2), parted by NaN), and each point coloured by its arrival error.
+    """The driven path (deck frame, shape (n, 2), parts separated by NaN), and each point coloured by its arrival error.
 
-    That is what the laser saw when the point was measured; with ``is_first`` the distance at the first arrival.
+    The error is the distance at the measurement by the laser; with ``is_first`` the distance at the first arrival.
     """
     wide = is_wide(width_px)
     axes = new_mirror_map(mirror, width_px, title, subtitle)
@@ -147,7 +147,7 @@ def path_figure(record: RunRecord, verdicts: Sequence[PointVerdict], width_px: f
 
 
 def driven_path_m(record: RunRecord) -> FloatArray:
-    """True path where there is one, else the estimated, deck x, y; shape (k, 2), sessions set apart by NaN."""
+    """True path, or else estimated path; deck x, y in m, shape (k, 2), sessions separated by NaN."""
     pieces: list[FloatArray] = [np.empty((0, 2))]
     for session in record.sessions:
         driven = session.track if session.truth is None else session.truth
@@ -156,7 +156,7 @@ def driven_path_m(record: RunRecord) -> FloatArray:
 
 
 def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width_px: float) -> Figure:
-    """The mirror with the paths of two runs, the later one above the earlier one."""
+    """The mirror with the paths of two runs; the later one is drawn over the earlier one."""
     axes = new_mirror_map(mirror, width_px, f"{mirror.name}: both paths")
     for (name, record), colour, width in zip(records.items(), plots.SERIES, (2.2, 0.8), strict=False):
         axes.plot(*driven_path_m(record).T, color=colour, linewidth=width, zorder=3, label=name)
@@ -167,7 +167,7 @@ def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width_px: flo
 def draw_from_run_dir(run_dir: Path, out: Path) -> None:
     """Draw the map of a run into a file, with the distances that the laser system measured.
 
-    PictureError: the run holds no points, or the map cannot be drawn; else as ``read_record``.
+    Raises PictureError: the run has no points, or the map cannot be drawn; otherwise as ``read_record``.
     """
     record = read_record(run_dir)
     if record.points is None:
@@ -192,7 +192,7 @@ def record_map(record: RunRecord, width_px: float) -> Figure:
 
 
 def draw_plan(mirror: Mirror, plan: SurveyPlan, out: Path) -> None:
-    """Draw the route of a planned survey, coloured by the time at which the robot is there; PictureError as above."""
+    """Draw the route of a planned survey, coloured by the planned time. Raises PictureError: it cannot be drawn."""
     width_px = MAP_WIDTH_PX * PX_PER_IN / MAP_DPI
     title = f"{mirror.name}: {len(plan.points) - len(plan.out_of_reach)} of {len(plan.points)} points"
     axes = new_mirror_map(mirror, width_px, title, f"{plan.length_m:.0f} m, {plan.least_s / 60.0:.1f} min at least")
@@ -229,9 +229,9 @@ def surface_figure(
     mirror: Mirror, panels: Sequence[PanelResult], title: str, width_px: float,
     scaled_as: Sequence[PanelResult] | None = None, subtitle: str | None = None, *, with_moves: bool = False,
 ) -> Figure:  # fmt: skip
-    """The deviation of the surface as fitted; dots, which vanish where the fit agrees, show what was measured.
+    """The fitted deviation of the surface, and the measured deviations as dots with the same colours.
 
-    The colours span the panels of ``scaled_as``; ``with_moves`` writes the move of each vertical adjuster, um.
+    The colour range is that of the panels ``scaled_as``; ``with_moves`` writes the move of each vertical adjuster, um.
     """
     wide = is_wide(width_px)
     axes = new_mirror_map(mirror, width_px, title, subtitle)
@@ -260,7 +260,7 @@ def surface_figure(
 def change_figure(
     mirror: Mirror, before: Sequence[PanelResult], after: Sequence[PanelResult], width_px: float
 ) -> Figure:
-    """What the later survey shows less the earlier one."""
+    """The later survey minus the earlier one."""
     axes = new_mirror_map(mirror, width_px, f"{mirror.name}: change of the surface")
     earlier = {panel.panel: panel for panel in before}
     cells = []
@@ -292,7 +292,7 @@ def _draw_cells(axes: Axes, cells: Sequence[PanelCells], spanned_m: Sequence[Flo
 
 
 def draw_alignment(mirror: Mirror, result: SurveyResult, out: Path, title: str, subtitle: str = "") -> None:
-    """Draw ``surface_figure`` with the adjuster moves into a file; PictureError as above."""
+    """Draw ``surface_figure`` with the adjuster moves into a file. Raises PictureError: it cannot be drawn."""
     if result.wavefront is not None:
         before, after = result.wavefront.before_m * _MICRO, result.wavefront.after_m * _MICRO
         title += f", half-wavefront error {before:.1f} um rms, {after:.1f} after the moves"

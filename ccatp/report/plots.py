@@ -1,6 +1,6 @@
 """Figures by matplotlib for reports, pictures and studies: colours, layout, files, SVG for a page, shorter series.
 
-matplotlib takes a second to import, so that it is imported only where something is drawn.
+matplotlib takes a second to import, so it is imported only where something is drawn.
 """
 
 import json
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 INK, QUIET, GRID, PAPER = "#1f2933", "#5f6c7b", "#e3e8ed", "#ffffff"
 PANEL, SEAM, PATH, BAD, GOOD = "#f1f4f7", "#c5ced8", "#8fa3b8", "#c93f3f", "#1d7a55"
-# They differ in lightness as well, for those who do not see colours, and for printers.
+# The colours also differ in lightness, for colour-blind readers and for printers.
 SERIES = ("#123f6d", "#e0902f", "#1d8a99", "#a8577e", "#8a96a3", "#5b7f2b")
 SMALL_TO_LARGE = ("#123f6d", "#1d8a99", "#f0b429")
 BELOW_TO_ABOVE = ("#2f6aa5", "#a9cbe3", "#f7f7f5", "#f3c08c", "#c25a28")
@@ -36,7 +36,7 @@ SVG = "http://www.w3.org/2000/svg"
 _XLINK = "http://www.w3.org/1999/xlink"
 _TOOLTIPS = "tooltips|"
 _PT_PER_IN = 72.0  # of SVG files
-_RASTER_DPI = 144.0  # of what an SVG holds as an image
+_RASTER_DPI = 144.0  # of images in an SVG
 
 
 class PictureError(UsageError):
@@ -44,7 +44,7 @@ class PictureError(UsageError):
 
 
 def check_drawing(folder: Path) -> None:
-    """Before the work: matplotlib is there, and the folder of the figures, which is made. PictureError: it is not."""
+    """Check that matplotlib is installed and make the folder of the figures; PictureError: one of these fails."""
     new_figure(1.0, 1.0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -57,14 +57,14 @@ def check_drawing(folder: Path) -> None:
 
 
 def new_figure(width_in: float, height_in: float, dpi: float = 160.0) -> "Figure":
-    """A figure that no window shows."""
+    """A figure without a window."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second
 
     return Figure(figsize=(width_in, height_in), dpi=dpi, facecolor="white", layout="constrained")
 
 
 def dress(*panels: "Axes", grid: Literal["major", "both"] = "major") -> None:
-    """Grid behind the data, quiet frames, small labels."""
+    """Draw the grid behind the data, frames in a light colour, small labels."""
     for axes in panels:
         axes.grid(True, which=grid, color=GRID, linewidth=0.6)
         axes.set_axisbelow(True)
@@ -79,7 +79,7 @@ def dress(*panels: "Axes", grid: Literal["major", "both"] = "major") -> None:
 def new_plot(width_px: float, title: str, heights_px: tuple[float, float] = (370.0, 320.0), log: str = "") -> "Axes":
     """A figure of a page with one plot, its height for a screen or for a phone; the title is its description.
 
-    ``log`` names a logarithmic axis, x or y; it has plain numbers at the decades.
+    ``log`` names a logarithmic axis, x or y; its labels are plain numbers at the decades.
     """
     from matplotlib.ticker import NullFormatter  # noqa: PLC0415
 
@@ -97,12 +97,12 @@ def new_plot(width_px: float, title: str, heights_px: tuple[float, float] = (370
 
 
 def is_wide(width_px: float) -> bool:
-    """For a screen or paper, not for a phone."""
+    """Whether the layout is for a screen or paper, not for a phone."""
     return width_px > NARROW
 
 
 def add_legend(axes: "Axes") -> "Figure":
-    """The labels of what is drawn, below the plot; returns its figure, which is complete with that."""
+    """Add the legend below the plot; return the complete figure."""
     figure = cast("Figure", axes.get_figure())
     handles, labels = axes.get_legend_handles_labels()
     columns = min(len(labels), 5) if is_wide(figure.bbox.width / figure.dpi * PX_PER_IN) else 2
@@ -115,7 +115,7 @@ def add_legend(axes: "Axes") -> "Figure":
 
 
 def add_tooltips(artist: "Artist", titles: Sequence[str]) -> None:
-    """What a browser shows over each mark of a collection or a line of markers, in their order."""
+    """Set the tooltip of each mark of a collection or a line of markers, in their order."""
     artist.set_gid(_TOOLTIPS + "|".join(title.replace("|", "/") for title in titles))
 
 
@@ -131,9 +131,9 @@ def ellipse_outline(covariance: FloatArray, sigmas: float) -> FloatArray:
 
 
 def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
-    """Write a figure as PNG, PDF or SVG, by the suffix; the same figure gives the same bytes on every day.
+    """Write a figure as PNG, PDF or SVG, by the suffix; the file contains no date.
 
-    ``dpi``: pixels an inch, if not the figure's own. PictureError: it cannot be written, or no such format is known.
+    ``dpi``: pixels per inch, by default the figure's own. Raises PictureError: not writable, or an unknown format.
     """
     undated: dict[str, dict[str, Any]] = {".png": {"Software": None}, ".pdf": {"CreationDate": None}}
     try:
@@ -149,7 +149,7 @@ def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
 def svg_of(figure: "Figure", *, is_file: bool = False) -> str:
     """The figure as an ``svg`` element that shrinks with its page; with ``is_file``, as a document with a size.
 
-    It needs nothing from outside, has no date, and its ids are unique among figures of other titles or widths.
+    It has no external resources and no date. Its ids are unique among figures with other titles or widths.
     """
     from matplotlib import rc_context  # noqa: PLC0415
 
@@ -174,7 +174,7 @@ def svg_of(figure: "Figure", *, is_file: bool = False) -> str:
 
 
 def _axes_of(figure: "Figure") -> list[dict[str, Any]]:
-    """The x and the y axis of the first plot, with their ends in the ``svg`` element, for those who point at it."""
+    """The x and the y axis of the first plot, with their ends in the ``svg`` element, for the pointer's readout."""
     axes, box = figure.axes[0], figure.axes[0].get_position()
     places = (
         (axes.xaxis, axes.get_xlim(), figure.get_figwidth() * box.intervalx),
@@ -208,7 +208,7 @@ def _add_titles(group: ET.Element, titles: Sequence[str]) -> None:
     defined = {id(one) for defs in group.iter(f"{{{SVG}}}defs") for one in defs.iter()}
     drawn = (f"{{{SVG}}}use", f"{{{SVG}}}path")
     marks = [one for one in group.iter() if one.tag in drawn and id(one) not in defined]
-    # A mark outside of the picture is not written, and its title would stand at another one.
+    # A mark outside the picture is not written, so its title would be assigned to another mark.
     for mark, title in zip(marks, titles if len(marks) == len(titles) else (), strict=False):
         ET.SubElement(mark, f"{{{SVG}}}title").text = title
 
@@ -226,7 +226,7 @@ class Envelope(NamedTuple):
 
 
 def envelope(x: FloatArray, y: FloatArray, intervals: int) -> Envelope:
-    """A series as so many intervals (at least 1) of equal length show it; values that are not finite are left out."""
+    """Reduce a series to intervals of equal length (at least 1); values that are not finite are left out."""
     is_good = np.isfinite(x) & np.isfinite(y)
     x, y = x[is_good], y[is_good]
     if not len(x):
@@ -246,7 +246,7 @@ def envelope(x: FloatArray, y: FloatArray, intervals: int) -> Envelope:
 
 
 def distinct(x: FloatArray, y: FloatArray, width_px: float) -> tuple[FloatArray, FloatArray]:
-    """Marks without those that fall on the same pixel of a figure of that width."""
+    """Marks without those at the same pixel as another one, for a figure of that width."""
     if not len(x):
         return x, y
     points = np.column_stack([x, y])

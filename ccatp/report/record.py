@@ -1,7 +1,7 @@
-"""A recorded survey as its report needs it, and its reader: a run that is complete, running or killed.
+"""Data of a recorded survey for its report, and their reader. The run may be complete, running or killed.
 
-What cannot be read is reported and left out; only a directory without a run, or a configuration that this program
-cannot use, is refused. Nothing is written. Raw sensor samples, nine tenths of a recording, are not read.
+Unreadable parts are reported and left out. Only a directory without a run, or a configuration that this program cannot
+use, is an error. Nothing is written. Raw sensor samples, nine tenths of a recording, are not read.
 """
 
 import json
@@ -39,12 +39,12 @@ class RecordedSession:
     name: str
     version: str
     track: Trace  # the estimates
-    sigma_m: FloatArray  # standard deviation of the place along any one direction, shape (k,)
+    sigma_m: FloatArray  # largest standard deviation of the place in any direction, shape (k,)
     truth: Trace | None  # None on a real robot
     arrivals: tuple[ArrivalMessage, ...]
     fixes: tuple[FixMessage, ...]
     statuses: tuple[MissionStatus, ...]
-    changes: tuple[StateChange, ...]  # from the log; empty where it does not hold them in order
+    changes: tuple[StateChange, ...]  # from the log; empty if the log does not have them in order
 
     @property
     def span_s(self) -> float:
@@ -53,7 +53,7 @@ class RecordedSession:
 
 
 class PointOutcome(NamedTuple):
-    """How a run ended, in a few words; why, where that is recorded; and whether that is as it should be."""
+    """Outcome of a run in a few words, its cause if recorded, and whether the run is complete."""
 
     text: str
     cause: str
@@ -62,21 +62,21 @@ class PointOutcome(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RunFiles:
-    """What every run leaves behind, whatever its mission."""
+    """Files and data of every run, independent of the type of its mission."""
 
     name: str
     config_text: str
-    changed: Mapping[str, tuple[object, object]]  # keys with another value than the shipped one: both values
+    changed: Mapping[str, tuple[object, object]]  # keys that differ from the shipped configuration: both values
     is_simulation: bool | None
     summary: Mapping[str, Any] | None
     log: tuple[LogLine, ...]
     files: Mapping[str, int]  # sizes in bytes
-    missing: tuple[str, ...]  # what a complete run would hold and this one does not, one line each
+    missing: tuple[str, ...]  # parts of a complete run that this run lacks, one line each
     warnings: tuple[str, ...]
 
     @property
     def when(self) -> str:
-        """Wall clock of the first and of the last line of the log, UTC; empty where it has none."""
+        """Time of the first and of the last line of the log, UTC; empty if there is none."""
         times = [line.wall[:19].replace("T", " ") + " UTC" for line in self.log if line.wall]
         return f"{times[0]} to {times[-1]}" if times else ""
 
@@ -100,15 +100,15 @@ class RunRecord(RunFiles):
 
     @property
     def has_truth(self) -> bool:
-        """Every recording with frames holds the simulated truth."""
+        """Whether every recording with frames has the simulated truth."""
         driven = [session for session in self.sessions if len(session.track.seq)]
         return bool(driven) and all(session.truth is not None for session in driven)
 
 
 def read_record(run_dir: Path) -> RunRecord:
-    """Everything that a report shows of a run.
+    """Read the data for the report of a survey.
 
-    RunReadError: no such directory, no run in it, or none of a survey; ConfigError: its configuration cannot be used.
+    Raises RunReadError: no such directory, no run in it, or no survey; ConfigError: its configuration cannot be used.
     """
     if is_beacon_run(run_dir):
         raise RunReadError(f"{run_dir}: a mission among beacons; this is for surveys, ccatp report takes both")
@@ -144,7 +144,7 @@ def read_record(run_dir: Path) -> RunRecord:
 
 
 def is_beacon_run(run_dir: Path) -> bool:
-    """Whether a run is a mission among beacons; RunReadError, ConfigError: there is none, or it cannot be read."""
+    """Whether a run is a mission among beacons. Raises RunReadError, ConfigError: no run, or it cannot be read."""
     check_run_dir(run_dir)
     return is_radio_file(run_dir / CONFIG)
 
@@ -152,7 +152,7 @@ def is_beacon_run(run_dir: Path) -> bool:
 def changed_keys(
     ours: Mapping[str, Any], shipped: Mapping[str, Any], prefix: str = ""
 ) -> dict[str, tuple[object, object]]:
-    """Keys of a configuration whose values differ: ours and the shipped ones; None where there is none."""
+    """Keys of a configuration whose values differ: own and shipped value, None if there is none."""
     found: dict[str, tuple[object, object]] = {}
     for key in dict.fromkeys((*ours, *shipped)):
         one, other = ours.get(key), shipped.get(key)
@@ -167,7 +167,7 @@ def changed_keys(
 
 
 class Recording(NamedTuple):
-    """The messages of a recording by topic, and what made it."""
+    """The messages of a recording by topic, and its metadata."""
 
     name: str
     messages: dict[str, list[Any]]
@@ -175,7 +175,7 @@ class Recording(NamedTuple):
 
 
 class RunFolder:
-    """Reads what is the same for every mission; collects what is missing and what cannot be read."""
+    """Reads the parts that every mission has; collects missing and unreadable parts."""
 
     def __init__(self, run_dir: Path, log_holds: str) -> None:
         self.run_dir = run_dir
@@ -187,14 +187,14 @@ class RunFolder:
             self.missing.append(f"{LOG}: {log_holds}")
 
     def fields(self) -> dict[str, Any]:
-        """Those of ``RunFiles``; to be called when everything else has been read."""
+        """The fields of ``RunFiles``; call it after everything else has been read."""
         return {
             "name": self.run_dir.resolve().name,
             "is_simulation": self.is_simulation,
             "config_text": (self.run_dir / CONFIG).read_text(encoding="utf-8", errors="replace"),
             "summary": self._summary(self.run_dir / SUMMARY),
             "log": tuple(line.shown for line in self.log if line.shown is not None),
-            # The report is no part of the run: it is the same when it is made again.
+            # The report is not part of the run, so that a repeated report is the same.
             "files": {
                 path.name: path.stat().st_size
                 for path in sorted(self.run_dir.iterdir())
@@ -216,7 +216,7 @@ class RunFolder:
         return None
 
     def recordings(self, topics: Iterable[str], columns: Mapping[str, int], holds: str) -> list[Recording | None]:
-        """All recordings, each up to its end or its first damage; None in place of one that cannot be read at all.
+        """All recordings, each up to its end or its first damage; None in place of an unreadable one.
 
         Messages of topics in ``columns`` are tables and become arrays of shape (k, columns).
         """
@@ -252,7 +252,7 @@ class RunFolder:
 
 
 def joined(batches: Sequence[FloatArray], columns: int, needed: int) -> FloatArray:
-    """One table, the frames growing, each once; rows whose first ``needed`` columns are not finite are left out."""
+    """One table with increasing and unique frames, without rows whose first ``needed`` columns are not finite."""
     rows = np.concatenate(batches) if batches else np.empty((0, columns))
     rows = rows[np.isfinite(rows[:, :needed]).all(axis=1)]
     _, first = np.unique(rows[:, 0], return_index=True)

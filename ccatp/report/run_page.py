@@ -1,6 +1,6 @@
 """The reports of surveys and beacon missions: pages, figures by the names of their files, and values as data.
 
-Lengths of the data of a survey in mm, times in s, unless a name says otherwise; null is not known.
+Data of a survey have lengths in mm and times in s, unless a name has another unit; null means not known.
 """
 
 from collections import Counter
@@ -26,7 +26,7 @@ from ccatp.report.tables import write_tables
 
 REPORT = "report.html"
 PAGE_MODE = 0o644
-_FEW = 12  # panels of a table; more are folded
+_FEW = 12  # panels of a table; a longer table is folded
 
 
 def report_run(
@@ -59,7 +59,7 @@ def report_run(
 
 
 def run_page(found: Findings) -> str:
-    """The report as one HTML file. A section that a run holds nothing for is left out."""
+    """The report as one HTML file. A section without data is left out."""
     record, fitted = found.record, () if found.alignment is None else found.alignment.panels
     panels = [
         (panel, mirror_wavefront([panel.rigid.wavefront]), worst_corner(record.mirror, panel), _remarks(panel))
@@ -88,7 +88,7 @@ def _remarks(panel: PanelResult) -> str:
 
 
 def run_drawings(found: Findings) -> dict[str, Draw]:
-    """What draws each figure of the report, by the names of their files."""
+    """Functions that draw the figures of the report, by file name."""
     record, alignment = found.record, found.alignment
     drawings: dict[str, Draw] = {}
     if found.points or record.sessions:
@@ -157,7 +157,7 @@ TITLES = {
 
 
 def beacon_page(record: BeaconRecord) -> str:
-    """The report as one HTML file. A section that a run holds nothing for is left out."""
+    """The report as one HTML file. A section without data is left out."""
     found = _beacon_findings(record)
     map_errors = [row.error_m for row in found["beacons"] if row.error_m is not None]
     return render(
@@ -174,7 +174,7 @@ def beacon_page(record: BeaconRecord) -> str:
 
 
 def beacon_drawings(record: BeaconRecord) -> dict[str, Draw]:
-    """What draws each figure of the report, by the names of their files."""
+    """Functions that draw the figures of the report, by file name."""
     has_track = bool(len(record.track.seq))
     drawings = {
         "map": (figures.beacon_map_figure, has_track),
@@ -187,7 +187,7 @@ def beacon_drawings(record: BeaconRecord) -> dict[str, Draw]:
 
 
 def beacon_data(record: BeaconRecord) -> dict[str, Any]:
-    """What ``ccatp report --json`` prints; lengths in m, null is not known."""
+    """Output of ``ccatp report --json``; lengths in m, null means not known."""
     cfg, found = record.cfg, _beacon_findings(record)
     outcome, errors, nis, pose_nees = (found[name] for name in ("outcome", "errors", "nis", "pose_nees"))
     known = [row.sigmas for row in found["waypoints"] if row.sigmas is not None]
@@ -245,7 +245,7 @@ def _beacon_findings(record: BeaconRecord) -> dict[str, Any]:
 
 
 def outcome_of(record: BeaconRecord) -> PointOutcome:
-    """How it ended, and why."""
+    """Outcome and its cause."""
     if record.summary is not None:
         outcome, cause = (str(record.summary.get(key) or "") for key in ("outcome", "cause"))
         return PointOutcome(outcome or "ended before its goal", cause, outcome == COMPLETE)

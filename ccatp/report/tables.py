@@ -1,7 +1,7 @@
 """Points with their fixes, panels, and moves of adjusters as files: CSV, and ECSV with units, types and metadata.
 
-A column carries its unit in its name. What is not known is an empty cell, which ECSV takes as masked. ECSV is that of
-astropy (APE 6): a header of YAML in comments, then CSV.
+The name of a column contains its unit. An unknown value is an empty cell, which ECSV reads as masked. ECSV is the
+format of astropy (APE 6): a YAML header in comments, then CSV.
 """
 
 import csv
@@ -64,7 +64,7 @@ _MOVES = {
 class Table(NamedTuple):
     """Columns with their descriptions, and rows by the names of the columns.
 
-    A value that a row lacks, or that is None, is not known; what has no column is left out.
+    A value that is missing in a row or None is not known; values without a column are left out.
     """
 
     columns: Mapping[str, str]
@@ -86,7 +86,7 @@ def write_tables(found: Findings, folder: Path) -> None:
 
 
 def csv_lines(table: Table) -> Iterator[str]:
-    """The names of the columns, and a line a row."""
+    """The names of the columns, then one line for each row."""
     text = StringIO()
     writer = csv.DictWriter(text, table.columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -106,7 +106,7 @@ def _ecsv_head(table: Table, metadata: Mapping[str, object]) -> Iterator[str]:
 
 
 def _yaml(value: object) -> str:
-    """A value of JSON is one of YAML; what does not print, such as a separator of lines, is escaped as YAML does it."""
+    """A value in YAML, which includes JSON; unprintable characters, such as line separators, are escaped for YAML."""
     text = json.dumps(value, ensure_ascii=False)
     return "".join(char if char.isprintable() else f"\\U{ord(char):08x}" for char in text)
 
@@ -137,7 +137,7 @@ def _fixes_table(found: Findings) -> Table:
 
 
 def panel_table(mirror: Mirror, result: SurveyResult) -> Table:
-    """How each panel that is determined lies, and how to turn its adjusters."""
+    """Position and tilt of each determined panel, and the turns of its adjusters."""
     names = result.panels[0].adjusters if result.panels else ()
     columns = {
         **_PLACE,

@@ -17,11 +17,11 @@ from ccatp.config.files import FOR_OTHERS, read_private, write_file
 from ccatp.config.models import DashboardConfig
 from ccatp.errors import ConfigError
 
-# 128 bits in hexadecimal digits: nothing limits the attempts.
+# 128 bits in hexadecimal digits: the number of attempts is not limited.
 MIN_CHARACTERS = 32
-# In the runtime directory: the token that this start has made, where none is configured.
+# In the runtime directory: the token made at the start if none is configured.
 TOKEN_FILE = "dashboard.token"  # noqa: S105 - the name of a file
-# Of a token without a name of its own.
+# Name of a token without a configured name.
 DEFAULT_NAME = "operator"
 _HOST = re.compile(r"(?P<name>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::[0-9]{1,5})?")
 _MAKE = "make one with: (umask 077; openssl rand -hex 24 > FILE)"
@@ -36,9 +36,9 @@ class CommandRefusal(NamedTuple):
 
 
 def host_refusal(host: str | None, names: Collection[str]) -> str | None:
-    """Why a request with this header ``Host`` is not served: no address, not ``localhost`` and no configured name.
+    """Reason to refuse a request with this ``Host`` header; None for an IP address, ``localhost`` or a configured name.
 
-    A foreign name may resolve to this address; an address is always that of this machine.
+    A foreign name may resolve to this machine's address, so other names are refused (DNS rebinding).
     """
     matched = _HOST.fullmatch(host or "")
     if matched is None:
@@ -55,7 +55,7 @@ def host_refusal(host: str | None, names: Collection[str]) -> str | None:
 def check_command(headers: Mapping[str, str], tokens: Mapping[str, str]) -> str | CommandRefusal:
     """The name of the token of a command with these headers, or why it is refused: its origin (403), its token (401).
 
-    Browsers send ``Origin`` and ``Sec-Fetch-Site``, other programs need not.
+    Browsers send ``Origin`` and ``Sec-Fetch-Site``; other programs may omit them.
     """
     host, origin, site = headers["host"].lower(), headers.get("origin"), headers.get("sec-fetch-site", "none")
     if origin is not None and origin.lower() not in (f"http://{host}", f"https://{host}"):
@@ -65,7 +65,7 @@ def check_command(headers: Mapping[str, str], tokens: Mapping[str, str]) -> str 
     scheme, space, given = headers.get("authorization", "").partition(" ")
     if scheme.lower() != "bearer" or not space:
         return CommandRefusal(401, f"commands need a token (Authorization: Bearer TOKEN): {_WHICH}")
-    # All of them, each in constant time: the time of an answer says nothing of a token.
+    # Compare with all tokens, each in constant time, so that the response time reveals nothing about a token.
     names = [name for name, token in tokens.items() if hmac.compare_digest(given.strip().encode(), token.encode())]
     return names[0] if names else CommandRefusal(401, f"the token is not accepted: give {_WHICH}")
 
@@ -80,7 +80,7 @@ def make_token(runtime_dir: Path) -> str:
 def read_tokens(path: Path) -> dict[str, str]:
     """The tokens in a file by name, a line each; ConfigError: it cannot be read, is open to others, or has a bad line.
 
-    No message quotes a line.
+    The messages contain no line of the file.
     """
     text = read_private(path, "dashboard.token_file", FOR_OTHERS, _MAKE).decode("ascii", "replace")
     tokens: dict[str, str] = {}

@@ -78,7 +78,7 @@ PROCESS_USE = {
 
 
 def process_use(pid: int) -> tuple[float, float] | None:
-    """Processor time, s, and resident memory, bytes, of a process; None where it is gone, or not on Linux."""
+    """Processor time (s) and resident memory (bytes) of a process; None if it has ended or this is not Linux."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -88,7 +88,7 @@ def process_use(pid: int) -> tuple[float, float] | None:
 
 
 class StateCollector(Collector):
-    """Collects the state of a run as metrics of Prometheus at each request; ``ground`` is that of the page."""
+    """Collects the state of a run as Prometheus metrics at each request; ``ground``: see ``survey_view.ground``."""
 
     def __init__(
         self, state: Callable[[], Mapping[str, Any]], pages: Callable[[], int], ground: Mapping[str, Any]
@@ -143,7 +143,7 @@ class StateCollector(Collector):
 
 STATIC = Path(__file__).resolve().parent / "static"
 ANSWERED_BY = {"control": "the main loop", "emergency": "the danger loop"}
-# Of all pages together; an operator has one at a time.
+# Pending commands of all pages together; an operator has one at a time.
 MAX_COMMANDS = 8
 HEADERS = {
     "content-security-policy": (
@@ -156,21 +156,21 @@ HEADERS = {
     "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
 }
-# Unsent bytes of an answer in the kernel; more of them would hide for longer that a client does not read.
+# Unsent bytes of an answer in the kernel; a larger buffer would delay the detection of a client that does not read.
 SEND_BUFFER_BYTES = 16_384
-# For answers that are not complete at the end; event streams end before.
+# For incomplete answers at the end; event streams end earlier.
 GRACE_S = 1
 KEEP_ALIVE_S = 5
 MAX_HEADER_BYTES = 16_384
 MAX_BODY_BYTES = 65_536
 TOO_LONG = f"the body of the request is longer than {MAX_BODY_BYTES} bytes"
 MAX_UNREAD_BYTES = 4_194_304
-# Every client of the port can cause lines of refusals.
+# Every client of the port can cause log lines of refusals, so their number is limited.
 REFUSAL_LINES, REFUSAL_PERIOD_S = 10, 60.0
 
 
 class CommandEndpoint:
-    """Passes commands of the page on to the daemon's channels; a command is answered when it took effect."""
+    """Passes commands of the page to the daemon's channels."""
 
     def __init__(
         self, context: zmq.Context[zmq.Socket[bytes]], endpoint_of: Callable[[str], str], timeout_s: float
@@ -180,7 +180,7 @@ class CommandEndpoint:
         self._slots = asyncio.Semaphore(MAX_COMMANDS)
 
     async def ask(self, command: str, frame: bytes) -> dict[str, Any] | CommandRefusal:
-        """Send a command and wait until it took effect; returns the reply, or why it did not."""
+        """Send a command and wait for the reply, which comes when it has taken effect; return it or the refusal."""
         if self._slots.locked():
             return CommandRefusal(503, f"{command}: {MAX_COMMANDS} commands wait for their answers already")
         channel = COMMANDS[command]
@@ -204,8 +204,8 @@ class CommandEndpoint:
 class RequestCheckMiddleware:
     """Refuses foreign host names with a reason, and bodies that are too long; adds the security headers.
 
-    After an answer to a body that was not read the rest is discarded, within limits: a client that sends all of it
-    before it reads gets the answer, too. Then the connection is closed.
+    If a request is answered before its body is read, the rest of the body is discarded, within limits. So a client that
+    sends the whole body before it reads also gets the answer. Then the connection is closed.
     """
 
     def __init__(self, app: ASGIApp, cfg: DashboardConfig) -> None:
@@ -275,7 +275,7 @@ def build_app(
         return _error(503, trouble) if trouble else _json({"status": "ok"})
 
     async def metrics(_request: Request) -> Response:
-        await hub.whole_state()  # also of a run that nobody watches, however rarely it is asked
+        await hub.whole_state()  # so that the pose is known even without an open page
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
     async def operator(request: Request) -> Response:
@@ -290,7 +290,7 @@ def build_app(
             if (left_out := refusals.take(asyncio.get_running_loop().time())) is not None:
                 log.info("page_request_refused", **line, why=by.message, left_out=left_out)
             return _refused(by)
-        request.state.is_command = True  # its connection stays
+        request.state.is_command = True  # its connection must not be closed
         reply = await commands.ask(name, _frame(name, await _body(request, cfg.slow_client_s), by))
         refusal = reply.message if isinstance(reply, CommandRefusal) else ""
         log.info("page_command", **line, by=by, refusal=refusal)
@@ -323,7 +323,7 @@ async def _body(request: Request, slow_client_s: float) -> bytes:
 
 
 def _command(request: Request) -> str:
-    """The path of a request as in ``COMMANDS``, where it is one of these."""
+    """The path of a request as in ``COMMANDS``, if it is one of these."""
     return request.url.path.removeprefix(PREFIX).strip("/")
 
 
@@ -368,10 +368,11 @@ def _error(code: int, message: str, headers: Mapping[str, str] | None = None) ->
 class LimitedProtocol(H11Protocol):
     """A connection with limits of number, time and size.
 
-    Where there are ``max_connections``, or half as many of one address, a new one takes the place of the oldest of
-    that address, or of those with the most: of one that serves no request, if there is one. A command is never closed.
-    One that for ``slow_client_s`` has sent no complete request, or accepted nothing of an answer, is closed, too.
-    uvicorn's ``limit_concurrency`` does not fit: at the limit it answers 503 on the open connections as well.
+    At most ``max_connections`` are open, and half as many of one address. A new connection above a limit closes the
+    oldest connection of its own address, or of the addresses with the most connections; one without a request is closed
+    first. A connection with a command is not closed; if there are only these, the new connection is closed.
+    A connection is also closed if for ``slow_client_s`` it sends no complete request or accepts no part of an answer.
+    uvicorn's ``limit_concurrency`` is not used: at the limit it answers 503 on the open connections as well.
     """
 
     max_connections: ClassVar[int]
@@ -380,7 +381,7 @@ class LimitedProtocol(H11Protocol):
     _opened_s = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Close another one if it is one too many."""
+        """Close a connection if a limit is exceeded."""
         super().connection_made(transport)
         self._opened_s = self.loop.time()
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
@@ -391,12 +392,12 @@ class LimitedProtocol(H11Protocol):
             surplus.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The other end, or a limit, has closed it."""
+        """The connection was closed by the client or by a limit."""
         self._limit(False)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Part of a request; the time runs until it is complete, uvicorn's keep-alive limit between requests."""
+        """Receive a part of a request; the time limit applies until the request is complete."""
         super().data_received(data)
         if self._is_serving:
             if not self.flow.write_paused:
@@ -405,12 +406,12 @@ class LimitedProtocol(H11Protocol):
             self._limit(True)
 
     def pause_writing(self) -> None:
-        """The client accepts nothing."""
+        """The client accepts no data: start the time limit."""
         super().pause_writing()
         self._limit(True)
 
     def resume_writing(self) -> None:
-        """The client has accepted something."""
+        """The client has accepted data: end the time limit."""
         super().resume_writing()
         self._limit(False)
 
@@ -419,7 +420,7 @@ class LimitedProtocol(H11Protocol):
         return bool(self.headers) and not self.cycle.response_complete
 
     def _find_surplus(self) -> "LimitedProtocol | None":
-        """The connection that gives way to this one: this one where all others are commands."""
+        """The connection to close if a limit is exceeded; this one if all others have commands."""
         address_of = {one: one.client and one.client[0] for one in self.connections if isinstance(one, LimitedProtocol)}
         number_at = Counter(address_of.values())
         if number_at[address_of[self]] > self.max_connections // 2:
@@ -443,7 +444,7 @@ class LimitedProtocol(H11Protocol):
 
 
 class _Server(uvicorn.Server):
-    """Without handlers of signals, which are those of the process."""
+    """A server without signal handlers: the process has its own."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

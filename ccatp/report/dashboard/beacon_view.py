@@ -30,7 +30,7 @@ def beacon_waypoints(cfg: RadioConfig) -> list[tuple[float, float]]:
 
 
 def beacon_ground(cfg: RadioConfig, *, is_sim: bool) -> dict[str, Any]:
-    """What does not change during a mission, as of ``survey_view.ground``; lengths in m, frame of the room."""
+    """Constant data of a mission, like ``survey_view.ground``; lengths in m, frame of the room."""
     width_m, depth_m = cfg.workspace.size_m
     is_following = cfg.follow.is_active
     goals = "seconds" if is_following else "waypoints"
@@ -65,10 +65,10 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool) -> dict[str, Any]:
     }
 
 
-# Rows of robot time (s) and: true error and three sigma of the position (mm), without the truth only the latter; true
+# Rows of robot time (s) and: true error and three sigma of the position (mm), without the truth only three sigma; true
 # error of the beacons and its expected standard deviation (both root mean square, mm); NIS and degrees of freedom of
-# the readings since the row before; distance to the target and the one to be kept (m); the smallest distance that a
-# distance sensor measures (m).
+# the readings since the row before; distance to the target and its set point (m); the smallest distance that a distance
+# sensor measures (m).
 LINES = ("error", "map", "target", "clearance")
 SERIES = (*LINES, "nis")
 # The page draws these from more frequent messages.
@@ -133,7 +133,7 @@ class BeaconView(RunStateView):
         return {**super()._levels(now_s), "facts": [(name, text) for name, text in facts.items() if text]}
 
     def _facts(self, message: BeaconMapMessage) -> dict[str, str | None]:
-        """Texts by their names; None is not known."""
+        """Texts by their names; None if not known."""
         static, size = standing_beacons(self._cfg, message), message.nis_size
         errors_m = expected_rms_m(static), true_rms_m(static, self._places)
         expected, true = (None if error_m is None else f"{1e3 * error_m:.1f} mm" for error_m in errors_m)

@@ -1,4 +1,4 @@
-"""What grows while a run lasts, bounded: series of the plots, the driven path, messages, errors against the truth."""
+"""Data that grow during a run, with a limit: series of the plots, driven path, messages, errors against the truth."""
 
 import asyncio
 import os
@@ -19,21 +19,21 @@ from ccatp.records.recorder import decode_recorded, iter_messages
 
 Row = tuple[Any, ...]
 
-# Batches come at least once a second: where nothing came for longer, nothing is known.
+# Batches come at least once a second, so a longer time without rows is a gap.
 GAP_S = 3.0
 # Not visible on a map of six metres.
 PATH_STEP_M = 0.02
 
 
 def is_gap(row: Row) -> bool:
-    """Whether a row says that nothing is known from the row before to the one behind it."""
+    """Whether a row marks a gap between the row before it and the row after it."""
     return all(value is None for value in row[1:])
 
 
 class Growing:
-    """Rows that begin with the mission's time (s), and the new ones; beyond ``limit`` the older half is thinned.
+    """Rows that begin with the mission's time (s); with more than ``limit`` the older half is thinned.
 
-    Where no row came for longer than ``gap_s`` stands a row without values: no line is drawn across it.
+    A time without rows longer than ``gap_s`` is marked by a row without values: no line is drawn across it.
     """
 
     def __init__(self, limit: int, gap_s: float = inf) -> None:
@@ -43,7 +43,7 @@ class Growing:
         self._new: list[Row] = []
 
     def add(self, t_s: float | None, *values: Any) -> None:
-        """Add a row, unless its time is not known; time does not go back."""
+        """Add a row if its time is known; a time before that of the last row is replaced by it."""
         if t_s is None:
             return
         t_s = max(t_s, self.rows[-1][0]) if self.rows else t_s
@@ -79,7 +79,7 @@ class Growing:
             self._thin()
 
     def _thin(self) -> None:
-        """Of each two rows of the older half the one with the larger value stays; so do the first row and gaps."""
+        """Keep the row with the larger value of each pair in the older half; keep the first row and gaps."""
         half, kept, is_first = len(self.rows) // 2, self.rows[:1], True
         for row in self.rows[1:half]:
             if is_gap(row):
@@ -107,7 +107,7 @@ class Trail(Growing):
 
 
 class Lines:
-    """The newest message of each kind to the operator: time (UTC, ISO format), level, text, count, number of its kind.
+    """Newest message of each kind to the operator: time (UTC, ISO format), level, text, count, number of its kind.
 
     ``left_out``: how many older messages were dropped.
     """
@@ -142,9 +142,9 @@ class Lines:
         return new
 
 
-# Frames between two that are compared: ten a second are.
+# Every tenth frame is compared, ten a second.
 EVERY = 10
-# Frames without a counterpart: batches of a second, and some reserve.
+# Largest number of frames that wait for their counterpart: batches of one second, with a margin.
 WAITING = 500
 
 
@@ -161,7 +161,7 @@ class TruthCompare:
 
     @staticmethod
     def is_compared(seq: int) -> bool:
-        """Whether a frame is one of those that are compared."""
+        """Whether a frame is compared."""
         return seq % EVERY == 0
 
     def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> None:
@@ -199,7 +199,7 @@ _MARKS = tuple(f'"{event}"'.encode() for event in SHOWN_EVENTS)
 
 
 class LogEntry(msgspec.Struct):
-    """What the page wants of a line of the log."""
+    """The parts of a log line that the page shows."""
 
     event: str = ""
     timestamp: str = ""
@@ -231,7 +231,7 @@ class RunFiles:
         self.emergencies: list[dict[str, str]] = []
 
     def read(self) -> None:
-        """Take what is new; what cannot be read is left out."""
+        """Read new data; data that cannot be read are ignored."""
         with suppress(OSError):
             self._file = self._file or self._log.open("rb")
             *lines, rest = (self._rest + self._file.read(MAX_READ_BYTES)).split(b"\n")
@@ -263,12 +263,12 @@ class RunFiles:
             self._lines.add(entry.timestamp, "warning", f"danger: {text}")
 
 
-# A recording of hours takes minutes to read: pages, heartbeats and messages go on meanwhile.
+# Reading a recording of hours takes minutes; pages, heartbeats and messages must continue meanwhile.
 READ_S, PAUSE_S = 0.02, 0.08
 
 
 async def replay(paths: Iterable[Path], topics: Iterable[str], receive: Callable[[Message], None]) -> None:
-    """Pass on the recorded messages of these topics, oldest first; what is damaged or missing is left out."""
+    """Pass the recorded messages of these topics to ``receive``, oldest first; damaged ones are left out."""
     wanted, due_s = frozenset(topics), time.monotonic() + READ_S
     for path in paths:
         with suppress(OSError):

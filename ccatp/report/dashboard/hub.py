@@ -1,4 +1,4 @@
-"""Reads the bus, and sends the same state to all open pages as server-sent events."""
+"""Reads the bus and sends the same state to all open pages as server-sent events."""
 
 import asyncio
 import time
@@ -16,9 +16,9 @@ from ccatp.report.dashboard.view import RunStateView
 class Wants(NamedTuple):
     """The topics of one kind of mission."""
 
-    main: tuple[str, ...]  # the rare ones besides those of every mission
-    track: str  # in batches, once a second or somewhat more often
-    truth: str  # likewise
+    main: tuple[str, ...]  # low-rate topics in addition to those of every mission
+    track: str  # published in batches, at least once a second
+    truth: str  # published in the same way
     once: tuple[str, ...]
 
 
@@ -26,22 +26,23 @@ SURVEY = Wants(("arrival", "fix", "scene"), "track", "truth", ())
 BEACONS = Wants(("beacon_arrival", "beacon_map", "scene"), "beacon_track", "beacon_truth", ("beacon_places",))
 _OF_MAIN = ("heartbeat.main", "mission")
 _OF_DANGER = ("heartbeat.danger", "danger_event")
-# At a time: a publisher that never pauses must not delay the pages.
+# From one subscriber at a time: a publisher that never pauses must not delay the pages.
 MAX_MESSAGES = 2_000
 
 
 class BusReader:
-    """Subscriptions of the dashboard: rare topics always, the others on request; no publisher waits for them."""
+    """Subscriptions of the dashboard: low-rate topics always, the others on request."""
 
     def __init__(
         self, context: zmq.Context[zmq.Socket[bytes]], endpoint_of: Callable[[str], str], view: RunStateView,
         *, is_sim: bool, wants: Wants = SURVEY,
     ) -> None:  # fmt: skip
         self._context, self._endpoint_of, self._view = context, endpoint_of, view
-        # The main loop makes a display state only for counted subscribers; a run counts those of the verdict.
+        # Counted subscribers have an effect: the main loop publishes every display state if it has one, and a daemon
+        # waits for a subscriber of the verdict. Only the subscription to every display state may count.
         uncounted, watched = {"is_uncounted": True}, {"is_uncounted": True, "is_watching": True}
         newest = {"keeps_newest": True}
-        # By whether they are read: publisher, topics, how.
+        # For each group of subscriptions: publisher, topics, options.
         self._rows: dict[str, list[tuple[str, tuple[str, ...], dict[str, bool]]]] = {
             "always": [("main", (*_OF_MAIN, *wants.main, wants.track), watched), ("danger", _OF_DANGER, watched)],
             "levels": [("main", ("display_state",), newest), ("danger", ("verdict",), newest | uncounted)],
@@ -53,7 +54,7 @@ class BusReader:
         self._read("always", True)
 
     def read(self, *, levels: bool) -> None:
-        """Whether display state and verdict are wanted ten times a second, or samples of the former are enough."""
+        """With ``levels``, read display state and verdict ten times a second, else only samples of the former."""
         if self._open["levels"] and not levels:
             self._view.discard_picture()
         self._view.is_watched = levels
@@ -61,7 +62,7 @@ class BusReader:
         self._read("samples", not levels)
 
     def drain(self, now_s: float) -> None:
-        """Pass the received messages on to the view, and what the run directory has got."""
+        """Pass received messages and new data of the run directory to the view."""
         self._view.read_files()
         for name, subscriber in self._open["always"].items():
             if subscriber.is_cut:
@@ -74,7 +75,7 @@ class BusReader:
                 self._view.receive(received[2], now_s)
 
     def close(self) -> None:
-        """Close sockets and files; a page that ends later opens none again."""
+        """Close sockets and files; they are not opened again when a page closes later."""
         self._view.close()
         for name in self._rows:
             self._read(name, False)
@@ -103,7 +104,7 @@ class StateBroadcaster:
 
     def __init__(self, reader: BusReader, view: RunStateView, rate_hz: float) -> None:
         self._reader, self._view, self._period_s = reader, view, 1.0 / rate_hz
-        # The next payload of each open page, and whether that must be the whole state: it is new, or was too slow.
+        # Next payload of each open page, and whether it must be the whole state, as for a new page or a slow one.
         self._pages: dict[asyncio.Queue[bytes], bool] = {}
         self._requested_s = float("-inf")
         self._is_over = False
@@ -114,11 +115,11 @@ class StateBroadcaster:
         return len(self._pages)
 
     def send_everything(self) -> None:
-        """Send the whole state next, for more has become known than what is new."""
+        """Send the whole state next, because earlier rows have changed."""
         self._pages = dict.fromkeys(self._pages, True)
 
     async def events(self) -> AsyncIterator[bytes]:
-        """The events for one page, until the end."""
+        """The events for one page, until the broadcaster stops."""
         page: asyncio.Queue[bytes] = asyncio.Queue(maxsize=1)
         self._pages[page] = True
         self._subscribe()
@@ -130,14 +131,14 @@ class StateBroadcaster:
             self._subscribe()
 
     def state(self) -> dict[str, Any]:
-        """The levels; pose and sensors are there from the second request on, see ``whole_state``."""
+        """The levels; the first request has no pose and no sensors, see ``whole_state``."""
         self._requested_s = now_s = time.monotonic()
         self._subscribe()
         self._reader.drain(now_s)
         return self._view.status_data(now_s)
 
     async def whole_state(self) -> dict[str, Any]:
-        """The levels with the pose, for which the main loop is given ``PICTURE_WAIT_S`` at the first request."""
+        """The levels with the pose; waits up to ``PICTURE_WAIT_S`` for the main loop to publish the pose."""
         state, patience_s = self.state(), time.monotonic() + PICTURE_WAIT_S
         while state["pose"] is None and state["mission"] and not (state["is_over"] or state["losses"]):
             if time.monotonic() > patience_s:
@@ -152,7 +153,7 @@ class StateBroadcaster:
         while not stop.is_set():
             self._subscribe()
             self.tick()
-            # Missed ticks are dropped: a page shows the present.
+            # Missed ticks are dropped: a page shows the current state.
             due_s = max(due_s + self._period_s, time.monotonic())
             with suppress(TimeoutError):
                 async with asyncio.timeout(max(due_s - time.monotonic(), 0.0)):
@@ -161,7 +162,7 @@ class StateBroadcaster:
         self.tick(is_last=True)
 
     def tick(self, *, is_last: bool = False) -> None:
-        """Read the bus, and send the state."""
+        """Read the bus and send the state."""
         now_s = time.monotonic()
         self._reader.drain(now_s)
         news = self._view.news(now_s)
@@ -175,7 +176,7 @@ class StateBroadcaster:
         payload = _event("news", news)
         for page in pages:
             if not page.empty():
-                page.get_nowait()  # the end replaces what was not taken
+                page.get_nowait()  # the end replaces an unread payload
             page.put_nowait(everything if is_last or self._pages[page] else payload)
             self._pages[page] = False
 

@@ -1,4 +1,4 @@
-"""THE table of the HTTP interface: the application's routes and ``GET /openapi.json`` are made of it."""
+"""The table of the HTTP interface: the application's routes and ``GET /openapi.json`` are made from it."""
 
 from http import HTTPStatus
 from typing import Any, NamedTuple
@@ -33,7 +33,7 @@ _DONE = _object("status", status=_OK)
 
 
 class Endpoint(NamedTuple):
-    """One row: path, what it is for, and what it answers with; with a ``channel`` it commands and needs a token."""
+    """One row: path, purpose and answer; a row with a ``channel`` is a command and needs a token."""
 
     path: str
     summary: str
@@ -82,9 +82,9 @@ ENDPOINTS = (
         channel="emergency", body=_object("id", id=_ID), errors=(400,),
     ),
 )  # fmt: skip
-# The path of each command without its slash, and the channel that answers it.
+# Path of each command without its slash, and the channel that answers it.
 COMMANDS = {row.path[1:]: row.channel for row in ENDPOINTS if row.method == "POST"}
-# What a command may be answered with besides its success.
+# Possible answers to a command other than success.
 _OF_TOKENS, _OF_COMMANDS = (401, 403), (408, 409, 413, 502, 503, 504)
 _LEVELS: dict[str, Schema] = {
     "mission": {"anyOf": [_ref("MissionStatus"), {"type": "null"}]},

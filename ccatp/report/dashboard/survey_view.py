@@ -31,7 +31,7 @@ WORDS = {
 
 
 def point_name(point: PointId) -> str:
-    """A point as the mission's status names it."""
+    """Name of a point in the mission's status."""
     return f"{point.row}-{point.col}-{point.point}"
 
 
@@ -41,7 +41,7 @@ def survey_points(mirror: Mirror, cfg: Config) -> list[PointId]:
 
 
 def ground(mirror: Mirror, cfg: Config, *, is_sim: bool) -> dict[str, Any]:
-    """What does not change during a run: map and settings of the page; lengths in m, deck frame."""
+    """Constant data of a run: map and settings of the page; lengths in m, deck frame."""
     base, observation = mirror.base_pose, cfg.observation
     about = {
         "telescope": observation.telescope,
@@ -89,8 +89,8 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool) -> dict[str, Any]:
     }
 
 
-# Rows of robot time (s) and: arrival error by the laser (mm); how far a fix moved the estimate (mm); NIS and degrees of
-# freedom; true error and three sigma of the position (mm), without the truth only the latter.
+# Rows of robot time (s) and: arrival error by the laser (mm); change of the estimate by a fix (mm); NIS and degrees of
+# freedom; true error and three sigma of the position (mm), without the truth only three sigma.
 SERIES, LINES = ("arrival", "jump", "nis", "error"), ("error",)
 FIX_DEGREES = 2  # of freedom of a fix
 

@@ -26,7 +26,7 @@ LATE_HEARTBEAT_S = 3.0 / BY_NAME["heartbeat.main"].rate_hz
 
 
 class LinkState(msgspec.Struct, frozen=True):
-    """A process or a device: its phase, seconds since its last message, and whether the link is well."""
+    """Link to a process or device: its phase, age of its last message (s), and whether the link works."""
 
     name: str
     phase: str
@@ -35,7 +35,7 @@ class LinkState(msgspec.Struct, frozen=True):
 
 
 class Loss(NamedTuple):
-    """A lost link, and for how long, s."""
+    """A lost link, and the time since its loss (s)."""
 
     what: str
     for_s: float
@@ -58,7 +58,7 @@ class Links:
         self.is_over = False
 
     def presence(self, presence: Heartbeat) -> None:
-        """Take the heartbeat of a process."""
+        """Store the heartbeat of a process."""
         name = presence.process
         before = self._liveness.heartbeats.get(name)
         is_new = before is None or before.pid != presence.pid
@@ -75,11 +75,11 @@ class Links:
         return {name: beat.pid for name, beat in self._liveness.heartbeats.items() if name in LOOPS}
 
     def cut(self, name: str, now_s: float) -> None:
-        """The connection to a process has ended."""
+        """Store that the connection to a process has ended."""
         self._cut_s.setdefault(name, now_s)
 
     def sensors_age_s(self, now_s: float) -> float | None:
-        """Age of the newest frame when the main loop last reported, and since then where that is late."""
+        """Age of the newest frame by the main loop's last heartbeat, plus the heartbeat's age if that is late (s)."""
         main = self._liveness.heartbeats.get("main")
         if main is None or main.frame_age_s is None:
             return None
@@ -87,11 +87,11 @@ class Links:
         return main.frame_age_s + (late_s if late_s > LATE_HEARTBEAT_S else 0.0)
 
     def losses(self, now_s: float) -> list[Loss]:
-        """Lost links, the gravest first; none when the mission is over."""
+        """Lost links, the most severe first; none when the mission is over."""
         return [] if self.is_over else [loss for _, loss in self._ends(now_s) if loss is not None]
 
     def trouble(self, now_s: float) -> str:
-        """Why the run is not well, also while it starts; empty when it is well."""
+        """The problem of the run, also while it starts; empty if there is none."""
         if self.is_over:
             return ""
         losses = self.losses(now_s)
@@ -102,7 +102,7 @@ class Links:
         return [link for link, _ in self._ends(now_s)]
 
     def _ends(self, now_s: float) -> list[tuple[LinkState, Loss | None]]:
-        """Each link, and how it is lost."""
+        """Each link, and its loss or None."""
         ends = [self._loop(name, now_s) for name in LOOPS]
         ends.append(self._robot(now_s, is_main_lost=ends[0][1] is not None))
         if self._has_laser:
@@ -144,7 +144,7 @@ def _age_s(since_s: float | None, now_s: float) -> float | None:
 # State of a point; arrived: the robot is at rest there.
 PLANNED, ARRIVED, MEASURED, SKIPPED = range(4)
 MAX_PATH, MAX_SAMPLES, MAX_LINES = 12_000, 4_000, 200
-# Over a shorter time the pace of the mission is not known: the finish is expected in real time.
+# After less time the rate of mission time to real time is not known, and the finish is predicted in real time.
 PACE_AFTER_S = 10.0
 NO_LINE = msgspec.Raw(b"null")
 _line = msgspec.json.Decoder(Sensors)
@@ -195,19 +195,19 @@ class RunStateView:
         }
 
     def receive(self, message: topics.Message | Verdict, now_s: float) -> None:
-        """Take a message of the bus; one that the page does not show is ignored."""
+        """Process a message of the bus; messages that the page does not show are ignored."""
         handler = self._handlers.get(type(message))
         if handler is not None:
             handler(message, now_s)
 
     def prepend(self, past: "RunStateView") -> None:
-        """Put what another view has of an earlier time before what this one has."""
+        """Insert the earlier data of another view before the data of this one."""
         self._trail.prepend(past._trail.rows)
         for name, series in self._series.items():
             series.prepend(past._series[name].rows)
 
     def _mission_s(self, t_s: float) -> float | None:
-        """The mission's time at the robot's time: it goes on when a robot boots or a run is resumed."""
+        """Convert robot time to mission time, which continues when a robot boots or a run is resumed."""
         return None if self._offset_s is None else round(t_s + self._offset_s, 2)
 
     def _take_status(self, status: MissionStatus, now_s: float) -> None:
@@ -236,11 +236,11 @@ class RunStateView:
         self._scene, self._is_scene_new = scene, True
 
     def discard_picture(self) -> None:
-        """Display states are not requested any more; the old one is not shown."""
+        """Discard the last display state: no new ones are requested."""
         self.links.picture_s = self._picture = self._sensors = None
 
     def news(self, now_s: float) -> dict[str, Any]:
-        """The levels, and the new rows of what grows."""
+        """The levels, and the new rows of the growing data."""
         self._ticks += 1
         state = self._levels(now_s) | {
             "points": [[k, self._states[k], self._errors_mm[k]] for k in sorted(self._changed)],
@@ -264,7 +264,7 @@ class RunStateView:
         }
 
     def status_data(self, now_s: float) -> dict[str, Any]:
-        """The levels with the run's trouble, for ``/status``."""
+        """The levels with the run's problem, for ``/status``."""
         return {**self._levels(now_s), "trouble": self.links.trouble(now_s)}
 
     def _mark(self, index: int, state: int) -> None:
@@ -287,7 +287,7 @@ class RunStateView:
         return status.point
 
     def _finish_in_s(self, status: MissionStatus, now_s: float) -> float | None:
-        """Until the expected end, s: a simulation in lockstep has a pace of its own."""
+        """Real time until the expected end (s); in lockstep mission time does not run at the rate of real time."""
         if status.outcome or self._began is None or status.eta_s <= 0.0:
             return None
         began_s, elapsed_s = self._began
@@ -296,7 +296,7 @@ class RunStateView:
         return status.eta_s * watched_s / (status.elapsed_s - elapsed_s)
 
     def _levels(self, now_s: float) -> dict[str, Any]:
-        """What is replaced as a whole; pose, mission and verdict with the fields of their messages."""
+        """The data that are sent whole each time; pose, mission and verdict have the fields of their messages."""
 
         def is_stale(since_s: float) -> bool:
             return now_s - since_s > STATUS_STALE_S and not self.links.is_over
