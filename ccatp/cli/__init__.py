@@ -1,6 +1,6 @@
-"""The table of commands. Only click is imported here: ``--help`` and completion must be quick.
+"""The table of commands. Only click is imported here, because ``--help`` and completion must be fast.
 
-Each module holds the commands of one purpose; ``common`` what they share.
+Each module has the commands of one purpose; ``common`` has their shared parts.
 """
 
 from collections.abc import Sequence

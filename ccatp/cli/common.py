@@ -1,4 +1,4 @@
-"""What every command shares: one-line errors, exit statuses, options, talk with a running daemon."""
+"""Common parts of the commands: one-line errors, exit statuses, options, connection to a running daemon."""
 
 import errno
 import io
@@ -20,10 +20,10 @@ from ccatp.config.package import configs_dir
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, one_line, printable
 
 Command = Callable[..., Any]
-_NOT_WRITTEN = (errno.ENOSPC, errno.EIO, errno.EBADF)  # a full device, a closed terminal, a stream for reading
-# Former names of commands, and what they are called now.
+_NOT_WRITTEN = (errno.ENOSPC, errno.EIO, errno.EBADF)  # full device, closed terminal, read-only stream
+# Former and present names of commands.
 RENAMED_COMMANDS = {"log": "recording", "recover": "repair", "map": "plot"}
-# Longer than any answer takes; what libzmq waits for is an int of milliseconds.
+# Longer than any answer takes; libzmq accepts a time-out as an int in milliseconds.
 LONGEST_WAIT_S = 86_400.0
 
 
@@ -31,7 +31,7 @@ PATH = click.Path(path_type=Path)
 
 
 class WaitingTime(click.ParamType[float]):
-    """Seconds to wait: more than none, and at most a day."""
+    """Time to wait, s: more than 0 and at most a day."""
 
     name = "seconds"
 
@@ -47,7 +47,7 @@ class WaitingTime(click.ParamType[float]):
 
 
 class ConfigFile(click.Path):
-    """The path of a configuration, or the name of a shipped one, as zigbee."""
+    """The path of a configuration, or the name of a shipped one, such as zigbee."""
 
     def __init__(self) -> None:
         super().__init__(path_type=Path)
@@ -64,13 +64,13 @@ class ConfigFile(click.Path):
         return configs_dir() / f"{path}.toml"
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        """As ``click.Path.shell_complete``, with the names."""
+        """As ``click.Path.shell_complete``, with the names of shipped configurations."""
         names = [CompletionItem(name) for name in shipped_names("") if name.startswith(incomplete)]
         return [*names, *super().shell_complete(ctx, param, incomplete)]
 
 
 class OutputFile(click.Path):
-    """A file to be written, with one of the suffixes ``formats``, if any: what cannot be is refused before the work."""
+    """A file to write, with one of the suffixes ``formats`` if given; a bad path is refused before the work."""
 
     def __init__(self, *formats: str) -> None:
         super().__init__(dir_okay=False, path_type=Path)
@@ -97,9 +97,9 @@ _errors_as_json = False
 
 
 class CommandGroup(click.Group):
-    """A group of commands that refuses a former name of one with the present one.
+    """A group of commands that refuses the former name of a command with a message of its present name.
 
-    ``sections``: titles of its help and the commands below them, in this order; without, all stand below one title.
+    ``sections``: titles in the help and the commands below them, in this order; without it there is one title.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class CommandGroup(click.Group):
             self.add_command(command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The first sentence of each command's help, whole, where click cuts it off."""
+        """Write the complete first sentence of each command's help; click shortens it."""
         for title, commands in (self.sections or {"Commands": [*self.commands.values()]}).items():
             texts = [" ".join((command.help or "").split()) for command in commands]
             firsts = [re.split(r"(?<=[.:;])\s", text, maxsplit=1)[0].rstrip(".:;") for text in texts]
@@ -135,8 +135,8 @@ def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> i
     """
     global _errors_as_json  # noqa: PLW0603 - of this process, like its standard error
     _errors_as_json = "--json" in (sys.argv[1:] if argv is None else argv)
-    # Matrices are small: threads would compete for the cores, and another number of them may round differently.
-    # Set before numpy is imported.
+    # The matrices are small: threads would compete for the cores, and their number can change the rounding.
+    # This must be set before numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _prepare_streams()
     try:
@@ -148,7 +148,7 @@ def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> i
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
-        except OSError:  # what is left in it goes nowhere
+        except OSError:  # discard the rest of the buffer
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
     return status
 
@@ -171,26 +171,26 @@ def _status_of(group: click.Group, argv: Sequence[str] | None) -> int:
         return complain(str(error), error.exit_status)
     except (click.Abort, KeyboardInterrupt):
         return complain("interrupted", ExitStatus.INTERRUPTED)
-    except BrokenPipeError:  # the reader of our output has seen enough
+    except BrokenPipeError:  # the reader of the output has closed the pipe
         return ExitStatus.REFUSED
     except OSError as error:
         if error.filename is None and error.errno in _NOT_WRITTEN:
             return complain(f"output cannot be written: {error.strerror}", ExitStatus.USAGE)
         if error.filename is None:
             raise
-        # too long a name, a folder that is not ours
+        # For example a name that is too long, or a folder without permission.
         what = f"{error.filename}: {error.strerror}; give another path, or correct this one"
         return complain(one_line(what), ExitStatus.USAGE)
     return int(status or 0)
 
 
 def _prepare_streams() -> None:
-    """Closed standard streams lead nowhere, not to the next file that is opened; any text can be written."""
+    """Connect closed standard streams to the null device, not to the next opened file; escape unencodable text."""
     for fd in range(3):
         try:
             os.fstat(fd)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # uses the lowest free descriptor
     sys.stdout = sys.stdout or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     sys.stderr = sys.stderr or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
@@ -199,11 +199,11 @@ def _prepare_streams() -> None:
 
 
 def complain(message: str, status: int) -> int:
-    """One line on standard error, and for ``--json`` an error as an object; returns ``status``."""
+    """Write one line on standard error; with ``--json`` an error (``status`` > 0) is an object. Return ``status``."""
     line = printable(" ".join(message.split()))
     if _errors_as_json and status:
         line = json.dumps({"error": line, "status": int(status)})
-    with suppress(OSError):  # nobody reads it
+    with suppress(OSError):  # standard error may be closed
         click.echo(line if line.startswith("{") else f"ccatp: {line}", err=True)
     return int(status)
 
@@ -257,7 +257,7 @@ def options(*decorators: Callable[[Command], Command]) -> Callable[[Command], Co
 
 
 def renamed_flag(old: str, new: str) -> Callable[[Command], Command]:
-    """A hidden flag under its former name, which is refused with the present one."""
+    """A hidden flag with the former name, which is refused with a message of the present name."""
 
     def refuse(ctx: click.Context, _param: click.Parameter, is_given: bool) -> None:
         if is_given:
@@ -268,7 +268,7 @@ def renamed_flag(old: str, new: str) -> Callable[[Command], Command]:
 
 
 def parse_setting(text: str) -> tuple[str, object]:
-    """``run.seed=2`` as ``("run.seed", 2)``, the value TOML or else text; ValueError: there is no key or no ``=``."""
+    """Parse ``run.seed=2`` to ``("run.seed", 2)``; a value that is not TOML is text. ValueError: no key or no ``=``."""
     from ccatp.config.messages import MOST_PARTS, parse_toml
 
     key, equals, value = text.partition("=")
@@ -279,12 +279,12 @@ def parse_setting(text: str) -> tuple[str, object]:
         found = parse_toml(f"value = {value}", "")
     except ConfigError:
         found = {}
-    # More than one line of TOML is a text, too.
+    # Several lines of TOML are text, too.
     return key.strip(), found["value"] if len(found) == 1 else value.strip()
 
 
 def _changes(ctx: click.Context) -> Any:
-    """What this command line sets of the configuration, by dotted key."""
+    """Configuration values that this command line sets, by dotted key."""
     return ctx.meta.setdefault("ccatp.changes", {})
 
 
@@ -298,7 +298,7 @@ def _take_settings(ctx: click.Context, _param: click.Parameter, values: Iterable
 
 
 def key_option(flag: str, key: str, **attributes: Any) -> Callable[[Command], Command]:
-    """An option that stands for a key of the configuration: part of ``settings``, where ``--set`` is stronger."""
+    """An option that sets a key of the configuration in ``settings``; ``--set`` has precedence."""
 
     def take(ctx: click.Context, _param: click.Parameter, value: object) -> None:
         if value is not None:
@@ -308,7 +308,7 @@ def key_option(flag: str, key: str, **attributes: Any) -> Callable[[Command], Co
 
 
 def names_of(folder: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
-    """Completes the names of shipped configurations in a folder; a path of a file is the shell's own business."""
+    """Complete the names of shipped configurations in a folder; the shell completes paths."""
     return lambda _ctx, _param, incomplete: [name for name in shipped_names(folder) if name.startswith(incomplete)]
 
 
@@ -323,13 +323,13 @@ def json_option(help_text: str) -> Callable[[Command], Command]:
 
 
 def figure_option(what: str) -> Callable[[Command], Command]:
-    """``--figure FILE``; ``what`` says what is drawn."""
+    """``--figure FILE``; ``what`` names the drawing."""
     formats = OutputFile(".png", ".pdf", ".svg")
     return click.option("--figure", "figure_file", type=formats, help=f"{what} (PNG, PDF or SVG).")
 
 
 def settings_option(which: str) -> Callable[[Command], Command]:
-    """``--set KEY=VALUE`` as ``settings``, with what other options set; ``which`` names the keys."""
+    """``--set KEY=VALUE`` as ``settings``, with the values of other options; ``which`` names the keys."""
     return click.option(
         "--set", "settings", multiple=True, callback=_take_settings, metavar="KEY=VALUE",
         help=f"{which} May be repeated.",
@@ -373,7 +373,7 @@ def address_options(section: str) -> Callable[[Command], Command]:
 
 
 def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
-    """The named runtime directory, else that of the only daemon that runs; None: none runs, ConfigError: several."""
+    """The given runtime directory, or that of the only running daemon, or None. ConfigError: several daemons run."""
     if runtime_dir is None and config_file is not None:
         from ccatp.daemon.process import processes_of, read_config
 

@@ -103,7 +103,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}")
 
 
 def _name(_ctx: click.Context, _param: click.Parameter, name: str | None) -> str | None:
-    """A name that stands in file names and in tables of TOML as it is."""
+    """A name that is valid in file names and as a TOML key without quotes."""
     if name is not None and not _NAME.fullmatch(name):
         raise click.BadParameter(f"{name!r}: letters, digits, - and _ only, at most 63")
     return name
@@ -198,7 +198,7 @@ def completion(context: click.Context, shell: str) -> int:
     kind: Any = get_completion_class(shell)
     script = kind(context.find_root().command, {}, "ccatp", VARIABLE)
     if shell == "bash" and shutil.which("bash") is None:
-        # click asks bash for its version first, which is of no use where there is none to ask.
+        # click asks bash for its version first, which fails if bash is not installed.
         text = script.source_template % script.source_vars()
     else:
         text = script.source()

@@ -21,7 +21,7 @@ _BACKLOG = 32
 
 
 class DeviceUnreachable(CcatpError):
-    """A device of the robot does not do what it must."""
+    """A device of the robot does not work as required."""
 
     exit_status = ExitStatus.UNREACHABLE
 

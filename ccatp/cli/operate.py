@@ -19,19 +19,19 @@ from ccatp.errors import ConfigError, DaemonUnreachableError
 _JSON = common.json_option("The daemon's answer as JSON on standard output.")
 DAEMON_OPTIONS = common.options(common.CONFIG_OPTION, common.RUNTIME_DIR_OPTION, common.TIMEOUT_OPTION, _JSON)
 EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
-# Without a terminal a line is shown at a change, and at least this often.
+# Without a terminal a line is written at each change, and at least at this interval.
 QUIET_S = 10.0
 
 
 def _ask(folder: Path | None, command: str, timeout_s: float, **fields: str) -> dict[str, Any]:
-    """One request to the operator channel of the daemon in a runtime directory, or the usual one."""
+    """Send a request to the operator channel of the daemon in a runtime directory, or in the default one."""
     from ccatp.links.client import OperatorClient
 
     return OperatorClient(folder, timeout_s).ask(command, **fields)
 
 
 def _print_reply(reply: Mapping[str, Any], json_output: bool, page: str = "") -> None:
-    """A daemon's answer on standard output; of the operator channel's, where the mission stands, and the page."""
+    """Print a daemon's answer; if it has a mission status, print its rows. ``page``: address of the page."""
     if json_output:
         click.echo(json.dumps(reply))
         return
@@ -44,7 +44,7 @@ def _print_reply(reply: Mapping[str, Any], json_output: bool, page: str = "") ->
 
 
 def _user() -> str:
-    """Who gives a command, for the daemon's log."""
+    """Name of the user who gives a command, for the daemon's log."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):  # a user without a name
@@ -108,7 +108,7 @@ def _ask_observatory(
     payload: Mapping[str, str], *, endpoint: str | None, server_key: Path | None, key_file: Path | None,
     config_file: Path | None, runtime_dir: Path | None, timeout_s: float,
 ) -> dict[str, Any]:  # fmt: skip
-    """One request to the observatory channel of a daemon here, or by TCP of one elsewhere."""
+    """Send a request to the observatory channel of a daemon on this machine, or by TCP on another one."""
     from ccatp.links.client import ObservatoryClient, OperatorClient
 
     if endpoint is None:
@@ -223,7 +223,7 @@ def status(
 
 
 def _answers(folder: Path | None, timeout_s: float, period_s: float) -> Iterator[dict[str, Any]]:
-    """One after the other, until the run is over or its daemon, which was there, is gone."""
+    """Answers one after the other, until the run is over or its daemon, once reached, has ended."""
     is_seen = False
     while True:
         try:

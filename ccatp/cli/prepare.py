@@ -1,4 +1,4 @@
-"""What is done before a mission: ``ccatp plan``, ``ccatp check`` and ``ccatp calibrate``."""
+"""The commands before a mission: ``ccatp plan``, ``ccatp check`` and ``ccatp calibrate``."""
 
 import json
 from collections.abc import Mapping
@@ -128,7 +128,7 @@ def calibrate(
         changes = {
             **settings,
             "run.order": "calibration",
-            "run.filter": "ekf",  # the four states have no use for the drive and plan none
+            "run.filter": "ekf",  # the four-state filter has no use for the calibration drive and does not plan it
             "mission.fix_at_start": True,
             "mission.calibration_rounds": rounds,
             "mission.calibration_length_m": length_m,
@@ -165,7 +165,7 @@ def calibrate(
 
 
 def _replaced(config_file: Path | None, driven: "Config") -> "Config":
-    """The configuration whose values are replaced: that of the file, else that of the drive."""
+    """The configuration whose values are replaced: that of the file if given, otherwise that of the drive."""
     if config_file is None:
         return driven
     from ccatp.config.load import load_config
@@ -181,14 +181,14 @@ def _replaced(config_file: Path | None, driven: "Config") -> "Config":
 
 
 def _write(config_file: Path | None, table: "tuple[CalibrationRow, ...]", *, dry_run: bool) -> tuple[str | None, str]:
-    """The file written, if one was, and what changes in it."""
+    """Write the values; return the name of the written file, or None, and the changes as text."""
     from ccatp.config.files import read_toml, write_file
     from ccatp.config.load import difference, load_config, with_values
 
     values = {row.key: row.rounded for row in table}
     if config_file is None:
         return None, "".join(f"{key} = {value}\n" for key, value in values.items())
-    load_config(config_file, values)  # what would be refused later is refused now
+    load_config(config_file, values)  # refuse invalid values before the file is written
     before = read_toml(config_file)
     after = with_values(before, values, config_file)
     changed = difference(before, after, config_file)

@@ -1,4 +1,4 @@
-"""The commands ``ccatp radio``: recorded runs through estimators, maps of motes from their ranges, signal levels."""
+"""The commands ``ccatp radio``: estimators on recorded runs, maps of motes from their ranges, signal levels."""
 
 import json
 import sys

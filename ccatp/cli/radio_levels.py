@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     Places = dict[str, tuple[float, float]]
 
 CONFIDENCE = 0.95
-_LEAST_DB = 0.3  # readings come in whole decibels: 1 / sqrt(12)
+_LEAST_DB = 0.3  # rounding to whole decibels has the standard deviation 1 / sqrt(12)
 SHEET_OPTION = click.option("--sheet", metavar="NAME", help="Sheet of the workbooks; the first if not given.")
 
 
@@ -74,8 +74,8 @@ def _fit_lines(name: str, fit: "PathLossFit") -> Iterator[str]:
 
 
 REGION = 0.9
-_CLEARLY = 6.9  # of log-likelihood: a thousand to one
-_LARGEST_M = 1e4  # of coordinates: levels reach no further than that
+_CLEARLY = 6.9  # difference of the log-likelihood: ratio of 1000 to 1
+_LARGEST_M = 1e4  # of coordinates: the range of radios is smaller
 _MOST_POINTS = 250_000  # of the grid: a few megabytes for each beacon
 
 

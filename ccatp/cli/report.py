@@ -1,4 +1,4 @@
-"""What is done with a run afterwards: ``ccatp report``, ``compare``, ``plot``, ``align`` and ``replay``."""
+"""The commands for recorded runs: ``ccatp report``, ``compare``, ``plot``, ``align`` and ``replay``."""
 
 import json
 import sys
@@ -81,7 +81,7 @@ def plot(run_dir: Path, out: Path | None) -> int:
     return 0
 
 
-# What the fixes are judged by, and what a localizer is built from; everything else has acted on the run already.
+# Keys with an effect on the alignment, and on a replay. All others had their effect during the run.
 ALIGN_KEYS = ("align.", "robot.puck_height_m", "mirror.")
 REPLAY_KEYS = ("localizer.", "robot.", "mirror.", "run.filter")
 PROGRESS_S = 50.0

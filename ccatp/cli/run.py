@@ -1,4 +1,4 @@
-"""``ccatp run``, ``dashboard`` and ``stream``: what runs until it is stopped."""
+"""The commands that run until they are stopped: ``ccatp run``, ``dashboard`` and ``stream``."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``ccatp runs``: which runs are here, how they ended, and what is in their directories."""
+"""``ccatp runs``: lists runs, their outcomes and the files in their directories."""
 
 import json
 import re
@@ -11,7 +11,7 @@ import click
 from ccatp.cli import common
 from ccatp.errors import ConfigError, ExitStatus
 
-# Files of a run directory, and what they are.
+# Files of a run directory and their descriptions.
 FILES = {
     "summary.json": "the result",
     "report.html": "the report, for a browser",
@@ -26,8 +26,8 @@ FILES = {
     "emergencies.json": "emergencies that are latched",
     "robot": "where the simulated robot stands",
 }
-_PART = re.compile(r"\.\d+\.mcap$")  # of the recording: one for each session
-# The line that says how a run ended is among the last ones of its log.
+_PART = re.compile(r"\.\d+\.mcap$")  # part of the recording, one for each session
+# The line with the outcome of a run is among the last lines of its log.
 _LAST_BYTES = 65_536
 
 
@@ -61,14 +61,14 @@ def show(run_dir: Path, json_output: bool) -> None:
     sizes = [
         f"{name:<24} {size / 1e6:10.3f} MB  {FILES.get(_PART.sub('.mcap', name), '')}".rstrip()
         for name, size in files.items()
-        if not name.startswith(".") and not name.endswith(".new")  # the program's own
+        if not name.startswith(".") and not name.endswith(".new")  # temporary files of this program
     ]
     lines = [f"{name:<15} {value}" for name, value in facts.items() if value != ""]
     common.print_result({**facts, "files": files}, [*lines, "", *sizes], json_output)
 
 
 def _facts(run_dir: Path) -> dict[str, Any]:
-    """One run; what its files do not say is an empty text."""
+    """The facts of one run; an unknown value is an empty text."""
     from ccatp.config.messages import parse_toml
     from ccatp.links.runtime_dir import is_held
     from ccatp.records.recorder import RUN_LOCK

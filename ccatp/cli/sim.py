@@ -10,7 +10,7 @@ import click
 from ccatp.cli import common
 from ccatp.errors import ConfigError
 
-# No laser reaches farther.
+# Limit of a coordinate of the puck; larger than the range of the laser.
 FARTHEST_PUCK_M = 1000.0
 FAILED = 1
 Place = tuple[float, float, float]

@@ -12,7 +12,7 @@ from ccatp.cli import common
 
 
 class _StudyCommand(click.Command):
-    """A command whose help lists the studies, from their table, when it is asked for."""
+    """A command whose help lists the studies; their table is read only when the help is requested."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         from ccatp.studies import STUDIES
