@@ -33,7 +33,7 @@ BEACON_TOPICS_READ = frozenset((*_COLUMNS, "beacon_map", "beacon_arrival", "beac
 
 
 def standing_beacons(cfg: RadioConfig, message: BeaconMapMessage) -> dict[str, BeaconEllipse]:
-    """The beacons of a map without the radio that is followed."""
+    """The beacons of a map, without the followed radio."""
     moving = cfg.follow.target if cfg.follow.is_active else ""
     return {name: ellipse for name, ellipse in message.beacons.items() if name != moving}
 
@@ -71,7 +71,7 @@ class BeaconRecord(RunFiles):
 
     @property
     def beacons(self) -> dict[str, BeaconEllipse]:
-        """Those that stand, as the newest map has them."""
+        """The stationary beacons of the newest map."""
         return standing_beacons(self.cfg, self.maps[-1]) if self.maps else {}
 
     @property

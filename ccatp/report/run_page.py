@@ -34,7 +34,7 @@ def report_run(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Write the report of a run, by default into its directory, its figures and tables if directories are given.
 
-    Returns what ``ccatp report --json`` prints, and warnings. RunReadError: no run there, or no survey for the tables;
+    Returns the output of ``ccatp report --json``, and warnings. RunReadError: no run, or no survey for the tables;
     ConfigError: its configuration cannot be used, or the page or a table cannot be written; PictureError: a figure.
     """
     path = out or run_dir / REPORT
@@ -104,7 +104,7 @@ def run_drawings(found: Findings) -> dict[str, Draw]:
 
 
 def run_data(found: Findings) -> dict[str, Any]:
-    """A survey's part of what ``ccatp report --json`` prints."""
+    """Data of a survey in the output of ``ccatp report --json``."""
     record, budget = found.record, found.budget
     first = [one.first_mm for one in found.points if one.first_mm is not None]
     return {
@@ -142,7 +142,7 @@ def _rounded(values: dict[str, float]) -> dict[str, float]:
 
 
 def wavefront_data(wavefront: MirrorWavefront | None) -> dict[str, float] | None:
-    """Half-wavefront errors, um; None where there are none."""
+    """Half-wavefront errors, um; None if there are none."""
     return wavefront and {name.removesuffix("_m"): round(v * MICRO, 4) for name, v in wavefront._asdict().items()}
 
 
@@ -216,7 +216,7 @@ def beacon_data(record: BeaconRecord) -> dict[str, Any]:
 
 
 def _beacon_findings(record: BeaconRecord) -> dict[str, Any]:
-    """How it ended; beacons and waypoints; of the frames that count and have a truth: errors and NEES; mean NIS."""
+    """Outcome, beacons, waypoints, mean NIS; errors and NEES of the evaluated frames that have a truth."""
     errors, nees = beacon_record.pose_errors_m(record), beacon_record.pose_nees(record)
     readings = beacon_record.readings_of(record)
     found: dict[str, Any] = {

@@ -1,4 +1,4 @@
-// The list of alarms, what is announced of it, and the emergencies: reported and cleared, each after a confirmation.
+// The list of alarms, its announcements, and the emergencies, which are reported and cleared after a confirmation.
 const SEVERITIES = ["", "inform", "slow", "pause", "hold", "return", "fault"];
 const LEVELS = ["", "note", "warn", "warn", "bad", "bad", "bad"];
 // Whatever else there is, these decide what the robot does (docs/operator.md).
@@ -22,7 +22,7 @@ export class Alarms {
     this.known = new Set();
     this.tones = null;
     this.chosen = null;
-    // What an operator turned on: a tone and a notification of the browser for each grave alarm that is new.
+    // If the operator turned it on: a tone and a browser notification for each new severe alarm.
     $("sound").onchange = () => {
       this.tones = $("sound").checked ? new AudioContext() : null;
       if (this.tones && "Notification" in window) Notification.requestPermission();
@@ -121,7 +121,7 @@ export class Alarms {
   }
 }
 
-// A row is made again only when it changed: a button must stay where it is while it is pressed.
+// A row is replaced only if it has changed: a button must not move while it is pressed.
 function fill(list, items, rowOf) {
   items.forEach((item, k) => {
     const key = JSON.stringify(item);

@@ -1,6 +1,6 @@
-// Pause, resume, abort in two steps, stop: what is sent, and what the daemon answers. Without a token: none of them.
+// Commands and the daemon's answers: pause, resume, abort in two steps, stop. All of them need a token.
 const ARMED_MS = 5000;
-// A double click is one wish, not two.
+// A double click is one command.
 const SETTLE_MS = 350;
 const NAMES = ["pause", "resume", "abort", "stop", "emergency"];
 const KEPT = "ccatp-token";
@@ -43,7 +43,7 @@ export class Commands {
     $("operator").textContent = name;
   }
 
-  // What makes sense now; while the link is lost abort, stop and emergency may still get through.
+  // Commands that are possible now; abort, stop and emergency may still arrive while the link is lost.
   receive({ mission, is_over }) {
     const state = mission?.state;
     const isOn = Boolean(mission) && !is_over;
@@ -97,7 +97,7 @@ export class Commands {
     this.say("");
   }
 
-  // Without a token the daemon refuses these, and says what is missing.
+  // Without a token the daemon refuses these with a reason.
   acknowledge(alarm) {
     this.post("alarms/ack", `acknowledge ${alarm}`, { name: alarm });
   }

@@ -1,5 +1,5 @@
-// Rows that begin with the mission's time and are bounded, by the rules of the server (history.py): of each two rows of
-// the older half the one with the larger value stays; a row without values is a gap, over which no line is drawn.
+// Rows that begin with the mission's time, limited by the rules of the server (history.py): of each two rows in the
+// older half the one with the larger value is kept; a row without values is a gap, across which no line is drawn.
 const isGap = (row) => row.slice(1).every((value) => value === null);
 const size = (row) => row[1] ?? -Infinity;
 

@@ -1,4 +1,4 @@
-// The map: panels, points, path, robot, and whatever else the daemon has to show. Metres, x to the right, y up.
+// The map: panels, points, path, robot, and further objects of the mission. Metres, x to the right, y up.
 import { Rows } from "./history.js";
 
 const PLANNED = 0, ARRIVED = 1, MEASURED = 2, SKIPPED = 3;
@@ -7,7 +7,7 @@ const BEYOND = 1.5; // metres outside of the rim that are still shown
 const ZOOM = [0.5, 400];
 const NEXT = 4;
 const MAX_PATH = 12000;
-// How many times the ellipse of three sigma is magnified: the operator chooses, and the legend says it.
+// Magnifications of the three sigma ellipse: the operator chooses one, and the legend shows it.
 const MAGNIFIED = [100, 1000, 1];
 const KEPT = "ccatp-ellipse";
 // A panel of at least this half width has room for its number between its points.
@@ -141,7 +141,7 @@ export class MapView {
     return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
   }
 
-  // What stands outside of the rim, but not far away: a first guess may be anywhere.
+  // Objects up to BEYOND outside the rim; distant ones are left out, because a first estimate may be anywhere.
   around(rim) {
     const xs = rim.map((p) => p[0]), ys = rim.map((p) => p[1]);
     const [x0, x1, y0, y1] = [Math.min(...xs) - BEYOND, Math.max(...xs) + BEYOND, Math.min(...ys) - BEYOND, Math.max(...ys) + BEYOND];
@@ -347,7 +347,7 @@ export class MapView {
     this.paintNext(pen, at, r);
   }
 
-  // The next point is ringed, those behind it are joined by a line.
+  // The next point has a ring; a line connects the points after it.
   paintNext(pen, at, r) {
     const next = this.byName?.get(this.mission?.next_point ?? "");
     if (next === undefined || this.mission.state === "done") return;

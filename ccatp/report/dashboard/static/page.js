@@ -22,7 +22,7 @@ const clock = (s) => {
   return h ? `${h}:${two(m)}:${two(all % 60)} h` : `${m}:${two(all % 60)} min`;
 };
 const age = (s) => (s === null ? "" : s < 9.95 ? `${s.toFixed(1)} s` : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
-// Of the server's clock: that of a phone may be wrong.
+// Time of the server's clock, because the clock of a phone may be wrong.
 const utc = (s) => new Date(1000 * s).toISOString();
 const day = (iso) => iso.slice(0, 10);
 const hour = (iso) => iso.slice(11, 19);
@@ -101,7 +101,7 @@ function receive(state, isAll) {
   show(state, isAll);
 }
 
-// The survey has ended only where the main loop has reported it: a driving robot must not be taken for a standing one.
+// The survey has ended only if the main loop has reported it: a moving robot must not be shown as a standing one.
 function end(state) {
   source.close();
   show(state, true);
@@ -163,7 +163,7 @@ function showTimes({ utc_s, started, mission, is_over }) {
   text("finish", finish ? `${day(finish) === day(now) ? "" : `${day(finish)} `}${hour(finish).slice(0, 5)}` : "–");
 }
 
-// As docs/dashboard.md has it: what an operator commanded is no alarm.
+// See docs/dashboard.md: a state that an operator commanded is not an alarm.
 function levelOf({ mission, losses, alarms: list }) {
   const isGrave = list.some((alarm) => !alarm.ended && ["hold", "return", "fault"].includes(alarm.severity));
   if (losses.length || (mission.state === "done" && mission.exit_status > 0)) return "bad";
@@ -245,7 +245,7 @@ function showRobot({ robot, pose, mission }) {
   text("pose-sigma", pose ? `${(3000 * Math.sqrt(Math.max(xx, yy, 0))).toFixed(2)} mm` : "–");
 }
 
-// Of each value: name, value, limit, whether it must be above it, how much the bar holds, and how it is written.
+// For each value: name, value, limit, whether it must be above the limit, range of the bar, format.
 function showGauges({ robot, laser, sensors_age_s }) {
   const percent = (value) => `${Math.round(100 * value)} %`;
   const ms = (value) => (value < 0.9995 ? `${Math.round(1000 * value)} ms` : `${value.toFixed(1)} s`);

@@ -15,7 +15,7 @@ const time = (s) => {
 };
 const short = (value) => (value == null ? "–" : String(Number(value.toPrecision(3))));
 
-// Of each plot the unit, whether it is logarithmic, and its columns: label, colour, how it is drawn.
+// For each plot: unit, whether it is logarithmic, and its columns with label, colour, style.
 const LOOKS = {
   arrival: { unit: "mm", isLog: true, columns: [{ label: "by the laser", ink: "--ink", isDots: true }] },
   error: {
@@ -45,7 +45,7 @@ const LOOKS = {
   },
   clearance: { unit: "m", columns: [{ label: "nearest", ink: "--ink" }] },
 };
-// Rows as they are sent into rows as they are drawn.
+// Converts sent rows to drawn rows.
 const SHAPE = { nis: ([t, nis, size]) => [t, nis === null ? null : nis / size] };
 
 export class Plots {
@@ -151,7 +151,7 @@ export class Plots {
     };
   }
 
-  // Limits and expected values, each with its words.
+  // Limits and expected values, each with its label.
   drawLines({ ctx, bbox, scales, valToPos }, name) {
     const ratio = devicePixelRatio || 1;
     ctx.save();
@@ -263,7 +263,7 @@ function decades({ min, max }) {
   return Array.from({ length: to - from + 1 }, (_, k) => 10 ** (to - k)).filter((_, k) => k % step === 0).reverse();
 }
 
-// From zero, with room above; one flat line is seen as well.
+// From zero, with a margin above, so that a constant line is visible.
 function range(low, high) {
   if (low === null || high === null) return [0, 1];
   return [Math.min(0, low), (high || 1) * 1.1];
