@@ -22,8 +22,8 @@ from ccatp.filters.base import (
 )
 
 STRONGEST = 3e3
-"""Largest ratio of a row's variance to its noise for an update by subtraction, which loses digits by this factor; so do
-rows that nearly repeat each other. Beyond it the update uses a QR factorisation."""
+"""Largest ratio of a row's variance to its noise for one subtraction, which loses digits by this factor; so do rows
+that nearly repeat each other. Up to the square of it an update has two subtractions, beyond it a QR factorisation."""
 MANY = 32
 """Number of rows beyond which a QR factorisation costs less than one of S."""
 
@@ -44,7 +44,7 @@ class _Rows:
         self.step, self.is_many, self.is_filled_up = size + 1, m > MANY, size > m
         self.S_diagonal, self.empty = self.S_flat[: m * size : size + 1], self.S_flat[m * size + m :: size + 1]
         self.project = 1.0, M, H, 0.0, V, 0, 0, 1  # V = M H^T
-        self.spread = 1.0, H, V, 0.0, S, 1, 0, 1  # S = H V
+        self.spread = 1.0, H, V, 0.0, S, 1, 0, 1  # S = H V, still without R
         self.factor = S, 1, 0, 1  # S -> C
         self.solve = 1.0, S, V, 1, 1, 1, 0, 1  # V -> V C^-T
         self.reduce = -1.0, V, V, 1.0, M, 0, 1, 1  # M -> M - V V^T
@@ -69,8 +69,8 @@ class KalmanFilter:
 
     A prediction reads only the upper triangle of M, so that the two halves differ at most by the rounding of one
     prediction and the updates after it. Elsewhere general products are used, because BLAS is slower for small symmetric
-    ones. The subtraction has an error of 1e-16 of the prior. If the posterior is much smaller, or rows nearly repeat
-    each other, a QR factorisation is used instead (``_rotate``).
+    ones. The subtraction has an error of 1e-16 of the prior. If the posterior is much smaller, an update has two of
+    them (``_subtract_twice``); if it is smaller still, or rows are many, a QR factorisation (``_rotate``).
 
     A nonlinear model is used with its Jacobian at the mean, F = df/dx and H = dh/dx: the extended filter.
     """
@@ -170,28 +170,28 @@ class KalmanFilter:
         rows.H_rows[...] = H
         dgemm(*rows.project)
         n = self._n
-        daxpy(z, rows.V_flat, z.size, 1.0, 0, 1, n, n + 1)
-        if expected is not None:
-            np.subtract(z, expected, rows.residual)
+        if expected is None:
+            daxpy(z, rows.V_flat, z.size, 1.0, 0, 1, n, n + 1)
+        else:
+            residual = z - expected
+            z = residual - rows.residual  # as if the model were linear
+            rows.residual[...] = residual
         residual = rows.residual.tolist()
-        if not rows.is_many:
-            dgemm(*rows.spread)
-            if R.ndim == 1:
-                noise = R.tolist()
-                daxpy(R, rows.S_flat, z.size, 1.0, 0, 1, 0, rows.step)
-            else:
-                noise = (noise_root(R).diagonal() ** 2).tolist()
-                np.add(rows.S_rows, R, rows.S_rows)
-            for s, r in zip(rows.S_diagonal.tolist(), noise):  # noqa: B905 - of one length; checking that takes longer
-                # The first comparison fails if P is not a covariance, both fail if a number is not finite.
-                if not r <= s < STRONGEST * r:
-                    break
-            else:
-                if rows.is_filled_up:
-                    rows.empty.fill(1.0)
-                if not dpotrf(*rows.factor)[1]:
-                    return self._subtract(rows, residual)
-        return self._rotate(rows, residual, R)
+        if rows.is_many:
+            return self._rotate(rows, residual, R)
+        noise = R.tolist() if R.ndim == 1 else (noise_root(R).diagonal() ** 2).tolist()
+        dgemm(*rows.spread)
+        ratio = 0.0
+        for s, r in zip(rows.S_diagonal.tolist(), noise):  # noqa: B905 - of one length; checking that takes longer
+            # The first comparison fails if P is not a covariance, both fail if a number is not finite.
+            if not 0.0 <= s < STRONGEST * STRONGEST * r:
+                return self._rotate(rows, residual, R)
+            if s > ratio * r:
+                ratio = s / r
+        if ratio <= STRONGEST:
+            nis = self._subtract(rows, residual, R, 1.0)
+            return self._rotate(rows, residual, R) if nis is None else Innovation(residual, nis)
+        return self._subtract_twice(rows, z, R, STRONGEST / ratio)
 
     def _check_measurement(
         self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray
@@ -218,15 +218,48 @@ class KalmanFilter:
         rows = self._rows[(m,)] = _Rows(self._n, m, self._M, self._U)
         return rows
 
-    def _subtract(self, rows: _Rows, residual: list[float]) -> Innovation:
-        """Update M to x + V y and P - V V^T, from P H^T above the residual and C in ``rows``."""
+    def _subtract(self, rows: _Rows, residual: list[float], R: FloatArray, share: float) -> float | None:
+        """Update M to x + V y and P - V V^T with R / ``share``, from P H^T above the residual and H P H^T in ``rows``.
+
+        Returns the NIS; None, without a change, if P is not a covariance.
+        """
+        if R.ndim == 1:
+            daxpy(R, rows.S_flat, R.size, 1.0 / share, 0, 1, 0, rows.step)
+        else:
+            np.add(rows.S_rows, R / share, rows.S_rows)
+        if rows.is_filled_up:
+            rows.empty.fill(1.0)
+        return None if dpotrf(*rows.factor)[1] else self._reduce(rows, residual, share)
+
+    def _reduce(self, rows: _Rows, residual: list[float], share: float = 1.0) -> float:
+        """``_subtract`` with S = C C^T in ``rows``; returns the NIS."""
         dtrsm(*rows.solve)
         nis: float = ddot(*rows.squares)
-        if not nis < HUGE:
+        if not nis < HUGE * share:  # with R instead of R / share it is at most nis / share
             raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")
         dgemm(*rows.reduce)
         self._mean = self._covariance = None
-        return Innovation(residual, nis)
+        return nis
+
+    def _subtract_twice(self, rows: _Rows, z: FloatArray, R: FloatArray, share: float) -> Innovation:
+        """Update with a ``share`` of the information of z, then with the rest; buffers as for ``_subtract``.
+
+        A reading with the noise R is as good as two independent ones of the same value with the noises R / share and
+        R / (1 - share); their NIS add up. Each subtraction loses only as many digits as it reduces the covariance, and
+        the second one reduces the error of the first one with it.
+        """
+        residual, n, before = rows.residual.tolist(), self._n, self._U
+        before[...] = self._M
+        nis = self._subtract(rows, residual, R, share)
+        if nis is not None:
+            dgemm(*rows.project)
+            daxpy(z, rows.V_flat, z.size, 1.0, 0, 1, n, n + 1)
+            dgemm(*rows.spread)
+            rest = self._subtract(rows, residual, R, 1.0 - share)
+            if rest is not None:
+                return Innovation(residual, nis + rest)
+            self._M[...], rows.residual[...] = before, residual
+        return self._rotate(rows, residual, R)
 
     def _rotate(self, rows: _Rows, residual: list[float], R: FloatArray) -> Innovation:
         """Update by least squares, which solve eqs 2.8 to 2.10 without a difference of covariances.

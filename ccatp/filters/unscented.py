@@ -113,7 +113,8 @@ class UnscentedKalmanFilter(KalmanFilter):
         rows.empty.fill(1.0)
         if dpotrf(*rows.factor)[1]:
             raise FilterDiverged("update is not finite, or the covariance of the measurement is not positive definite")
-        return self._subtract(rows, rows.residual.tolist())
+        residual = rows.residual.tolist()
+        return Innovation(residual, self._reduce(rows, residual))
 
     def _draw(self) -> FloatArray:
         n = self._n
