@@ -6,7 +6,7 @@ from math import cos, hypot, inf, sin, sqrt
 from operator import mul
 from typing import NamedTuple
 
-from ccatp.core import FloatArray, ImuSample
+from ccatp.core import FloatArray, ImuSample, Vector3
 from ccatp.mirror.mirror import Mirror
 
 # Third derivatives of these mirrors stay below 3e-3 1/m^2, so within this distance a slope is off by less than 1e-7.
@@ -74,6 +74,15 @@ def axes_on(slope: Slope, psi: float) -> tuple[float, float, float, float]:
     ex, ey = -fx * fy / (norm * s), s / norm
     c, d = cos(psi), sin(psi)
     return c / s + d * ex, d * ey, c * ex - d / s, c * ey
+
+
+def gravity_on(slope: Slope, psi: float, gravity: Vector3) -> Vector3:
+    """Gravity, given in the deck frame, in the frame of a robot with heading ``psi``."""
+    fx, fy = slope[0], slope[1]
+    gx, gy, gz = gravity
+    hx, hy, lx, ly = axes_on(slope, psi)
+    along = (gz - fx * gx - fy * gy) / sqrt(1.0 + fx * fx + fy * fy)
+    return hx * gx + hy * gy + (fx * hx + fy * hy) * gz, lx * gx + ly * gy + (fx * lx + fy * ly) * gz, along
 
 
 _STILL_M = 2e-5

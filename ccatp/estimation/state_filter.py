@@ -12,7 +12,7 @@ from ccatp.core import DeckPose, FloatArray, PanelId, difference
 from ccatp.estimation import state_model as sm
 from ccatp.estimation.fixes import fix_row, relocated
 from ccatp.estimation.localizer_base import SensorTransition
-from ccatp.estimation.odometry import PreintegratedMotion, Slope, Terrain, WheelAngle
+from ccatp.estimation.odometry import PreintegratedMotion, Slope, Terrain, WheelAngle, gravity_on
 from ccatp.estimation.rest import ZeroVelocityReading, heading_from_gravity
 from ccatp.estimation.seams import SeamLines
 from ccatp.estimation.slip_prior import SlipPrior
@@ -123,10 +123,10 @@ class SurveyFilter:
     def _predict(self, dt_s: float, slips: tuple[float, float, float], encoders: float) -> None:
         full, (slip, creep, turn_creep) = self._full, slips
         mean: FloatArray = self._filter.mean
-        self.turn_creep_share = share = self._turn_creep.share(
-            self._mirror.gravity_in_robot(DeckPose(*mean[:3].tolist()))
-        )
-        motion = self._motion.over(dt_s, self.slope(), share)
+        slope = self.slope()
+        gravity = gravity_on(slope, float(mean[sm.PSI]), self._gravity_deck)
+        self.turn_creep_share = share = self._turn_creep.share(gravity)
+        motion = self._motion.over(dt_s, slope, share)
         jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
         impulses = np.array((jerk, twist, slip, slip, creep, turn_creep))
         drift = self._drift  # work space; the model does not keep it
@@ -179,8 +179,7 @@ class SurveyFilter:
     def _update_with_gravity(self, bearing_rad: float, count: int) -> None:
         mean, full = self._filter.mean, self._full
         slope = self.slope()
-        gx, gy, gz = self._gravity_deck
-        along = (gz - slope.fx * gx - slope.fy * gy) / sqrt(1.0 + slope.fx * slope.fx + slope.fy * slope.fy)
+        _, _, along = gravity_on(slope, float(mean[sm.PSI]), self._gravity_deck)
         tilt = sqrt(max(1.0 - along * along, 0.0))  # sine of the angle between the surface and the horizontal
         if tilt < full.gravity_least_tilt:
             return
