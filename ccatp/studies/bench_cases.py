@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, FloatArray
 from ccatp.estimation import state_model as sm
-from ccatp.estimation.odometry import Terrain
+from ccatp.estimation.odometry import Terrain, WheelAngle
 from ccatp.filters import FILTERS
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
@@ -53,11 +53,15 @@ class Race(NamedTuple):
 
 def races(cfg: Config) -> Iterator[Race]:
     """Steps of filters, of range SLAM (a prediction and a scalar update) and of multilateration."""
-    # kf: the inertial unit, with none, one and ten samples of each wheel. ekf: the models as matrices.
-    linear = [("kf", thesis_problem(cfg, m)) for m in (2, 4, 22)]
-    linear += [("ekf", linearised_problem(cfg, m)) for m in (4, 6, 23)]
-    for filter_name, problem in (*linear, ("ukf", survey_problem(cfg))):
-        name = f"{filter_name} predict + update, n = {problem.mean.size}, m = {problem.variances.size}"
+    # kf: the inertial unit, with none, one and ten samples of each wheel. ekf: the models as matrices. In the last case
+    # wheel angles are as exact as the localizer assumes for a rate encoder: an update has two subtractions, as most
+    # updates of a survey have.
+    problems = [("kf", thesis_problem(cfg, m), "") for m in (2, 4, 22)]
+    problems += [("ekf", linearised_problem(cfg, m), "") for m in (4, 6, 23)]
+    problems += [("ekf", linearised_problem(cfg, 4, WheelAngle().variance_rad2()), ", angles to 1e-5 rad")]
+    problems += [("ukf", survey_problem(cfg), "")]
+    for filter_name, problem, detail in problems:
+        name = f"{filter_name} predict + update, n = {problem.mean.size}, m = {problem.variances.size}{detail}"
         peers: dict[str, Contender]
         peers = {"filterpy": partial(filterpy, problem), "Stone Soup": partial(stonesoup, problem)}
         if filter_name != "ukf":
@@ -119,8 +123,11 @@ def linear_problem(
     return FilterProblem(mean, covariance, F, H, Q, variances, readings)
 
 
-def survey_problem(cfg: Config) -> FilterProblem:
-    """The full-state localizer's problem with its models: n = 20; readings: both wheel angles, rate, acceleration."""
+def survey_problem(cfg: Config, angle_rad2: float = _ANGLE_RAD2) -> FilterProblem:
+    """The full-state localizer's problem with its models: n = 20; readings: both wheel angles, rate, acceleration.
+
+    ``angle_rad2``: variance of a reading of a wheel angle.
+    """
     rng = np.random.default_rng((SEED, sm.STATES))
     robot, full = cfg.robot, cfg.localizer.full_state
     mean, sigma = np.zeros(sm.STATES), np.zeros(sm.STATES)
@@ -143,7 +150,7 @@ def survey_problem(cfg: Config) -> FilterProblem:
     drift[[sm.PR, sm.PL]] = cfg.localizer.encoder_sigma_rad_s**2 * full.encoder_period_s * DT_S
     Q = motion.noise(mean, impulses, drift)
     gyroscope, accelerometer = cfg.localizer.gyroscope_sigma_rad_s**2, cfg.localizer.accelerometer_sigma_m_s2**2
-    variances = {sm.W: gyroscope, sm.PR: _ANGLE_RAD2, sm.PL: _ANGLE_RAD2, sm.A: accelerometer}
+    variances = {sm.W: gyroscope, sm.PR: angle_rad2, sm.PL: angle_rad2, sm.A: accelerometer}
     sight = sm.SensorRows([(state, 0.0, variance) for state, variance in variances.items()])
     x, readings = mean + 0.5 * sigma * rng.normal(size=sm.STATES), np.empty((STEPS, sight.R.size))
     for i in range(STEPS):
@@ -152,12 +159,12 @@ def survey_problem(cfg: Config) -> FilterProblem:
     return FilterProblem(mean, np.diag(sigma**2), motion, sight, Q, sight.R, readings)
 
 
-def linearised_problem(cfg: Config, rows: int) -> FilterProblem:
+def linearised_problem(cfg: Config, rows: int, angle_rad2: float = _ANGLE_RAD2) -> FilterProblem:
     """``survey_problem`` with its initial Jacobians as matrices, so that the filter is timed without the models.
 
     Rows: the four sensors (4); with a fix of both coordinates (6); with ten samples of each wheel and a heading (23).
     """
-    problem = survey_problem(cfg)
+    problem = survey_problem(cfg, angle_rad2)
     F, sensors = problem.F.at(problem.mean)[1].copy(), problem.H.at(problem.mean)[1].copy()
     fix, heading = np.eye(sm.STATES)[[sm.X, sm.Y]], np.eye(sm.STATES)[[sm.PSI]]
     H, variances = {
