@@ -426,11 +426,11 @@ class MainLoop(RobotLoop):
         """Send the drive that was computed from frame ``ack``."""
         self._drive_seq += 1
         ack, right, left = max(ack, 0), drive.right_rad_s, drive.left_rad_s
-        self._runner.on_drive(self._drive_seq, right, left)
+        self.link.send_drive(self._drive_seq, ack, right, left, drive.steer_rad)
         self._sent = ack, drive
+        self._runner.on_drive(self._drive_seq, right, left)
         if not self.is_lockstep:
             self._frame_age.add_drive(self._drive_seq, time.monotonic())
-        self.link.send_drive(self._drive_seq, ack, right, left, drive.steer_rad)
 
     def answer_again(self) -> None:
         if self._sent is not None:
