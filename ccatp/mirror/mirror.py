@@ -232,15 +232,18 @@ def _on_panel(surface: Surface, panel: Panel, places: FloatArray) -> FloatArray:
     points = np.array(panel.origin) + places[:, :2] @ axes[:2]
     for _ in range(_DROP_STEPS):
         x, y, z = points.T
-        fx, fy = surface.gradients(x, y)
-        gap = (surface.heights_m(x, y) - z) / (axes[2, 2] - fx * axes[2, 0] - fy * axes[2, 1])
+        f, fx, fy = surface.heights_and_gradients(x, y)
+        gap = (f - z) / (axes[2, 2] - fx * axes[2, 0] - fy * axes[2, 1])
         points += gap[:, None] * axes[2]
     x, y, z = points.T
     fx, fy = surface.gradients(x, y)
-    e1 = np.column_stack([np.ones_like(fx), np.zeros_like(fx), fx]) / np.sqrt(1.0 + fx * fx)[:, None]
-    n = np.column_stack([-fx, -fy, np.ones_like(fx)]) / np.sqrt(1.0 + fx * fx + fy * fy)[:, None]
     # The heading lies in the tangent plane at the robot and projects on (cos, sin, 0) of the panel frame.
-    flat = np.cos(places[:, 2, None]) * axes[0] + np.sin(places[:, 2, None]) * axes[1]
-    h = flat - ((flat * n).sum(axis=1) / (n @ axes[2]))[:, None] * axes[2]
-    heading = np.arctan2((h * np.cross(n, e1)).sum(axis=1), (h * e1).sum(axis=1))
+    c, d = np.cos(places[:, 2]), np.sin(places[:, 2])
+    ax, ay, az = (c * p + d * q for p, q in zip(axes[0], axes[1], strict=True))
+    bx, by, bz = axes[2]
+    along = (az - fx * ax - fy * ay) / (bz - fx * bx - fy * by)
+    hx, hy, hz = ax - along * bx, ay - along * by, az - along * bz
+    # Its components along the axes e1 and e2 of ``Surface.axes``, both times sqrt(1 + fx^2).
+    s2 = 1.0 + fx * fx
+    heading = np.arctan2((s2 * hy + fy * hz - fx * fy * hx) / np.sqrt(s2 + fy * fy), hx + fx * hz)
     return np.column_stack([x, y, heading, z])

@@ -37,7 +37,7 @@ class Surface:
     methods with plural names take arrays.
     """
 
-    __slots__ = ("_coefficients", "_rows", "_slopes")
+    __slots__ = ("_coefficients", "_rows", "_with_slopes")
 
     def __init__(self, coefficients: FloatArray) -> None:
         """``coefficients``: c_ij in m^(1-i-j), shape (powers of x, powers of y).
@@ -47,7 +47,9 @@ class Surface:
         if coefficients.ndim != 2:
             raise ValueError(f"surface coefficients need shape (i, j), got {coefficients.shape}")
         self._coefficients = c = coefficients.astype(np.float64)
-        self._slopes = polyder(c, axis=0), polyder(c, axis=1)
+        self._with_slopes = together = np.zeros((*c.shape, 3))  # of f, fx and fy
+        together[..., 0] = c
+        together[:-1, :, 1], together[:, :-1, 2] = polyder(c, axis=0), polyder(c, axis=1)
         # Highest power first, as for Horner's scheme, without the trailing zeros of each row.
         self._rows = tuple(tuple(np.trim_zeros(row, "b")[::-1].tolist()) for row in c[::-1])
 
@@ -175,8 +177,13 @@ class Surface:
 
     def gradients(self, xs: FloatArray, ys: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Slopes (fx, fy) of many points, each of the shape of ``xs``."""
-        fx, fy = (np.asarray(polyval2d(xs, ys, slope), dtype=np.float64) for slope in self._slopes)
+        fx, fy = polyval2d(xs, ys, self._with_slopes[..., 1:])
         return fx, fy
+
+    def heights_and_gradients(self, xs: FloatArray, ys: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Heights, m, and slopes (f, fx, fy) of many points, each of the shape of ``xs``."""
+        f, fx, fy = polyval2d(xs, ys, self._with_slopes)
+        return f, fx, fy
 
 
 def build_surface(cfg: SurfaceConfig, drive_side: int) -> Surface:
