@@ -48,7 +48,7 @@ class Segment:
     gyro_rad: float
     gyro_s: float
     gyro_samples: int
-    duration_s: float
+    duration_s: float  # of the frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ class DriveBuilder:
         if not motions:
             # This rest has no segment of its own: keep its gyroscope sum, which contains the bias, for the next one.
             self._places[-1] = place
-            self._open = replace(done, right=[], left=[])
+            self._open = replace(done, right=[], left=[], begun_s=self._t_s)
             return
         self._places.append(place)
         duration_s = self._t_s - done.begun_s

@@ -14,7 +14,7 @@ from ccatp.cli import main
 from ccatp.commissioning.calibration import Calibration, CalibrationError, calibrate, check_usable, lines, rows
 from ccatp.commissioning.calibration_drive import DriveBuilder, RecordedDrive, WheelParameters, carry
 from ccatp.config.load import dump_config, load_config
-from ccatp.core import Fix, FloatArray
+from ccatp.core import Fix, FloatArray, WheelSample
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage, SensorLines
@@ -101,6 +101,27 @@ def driven() -> CalibrationDrive:
 @pytest.fixture(scope="module")
 def drive(driven: CalibrationDrive) -> RecordedDrive:
     return driven.drive
+
+
+def test_a_second_fix_at_a_place_drops_the_rest_between_them(driven: CalibrationDrive) -> None:
+    frames, (seq, fix), builder = driven.frames, driven.fixes[0], DriveBuilder(driven.mirror, 0.0)
+    stop = next(k for k, frame in enumerate(frames) if frame.seq == seq)
+    end = next(k for k, frame in enumerate(frames) if frame.seq == driven.fixes[1][0])
+    for rest in range(stop + 1):
+        builder.frame(frames[rest])
+    for seconds in range(3):  # measured again while it stands
+        for k in range(100):
+            t_s, number = frames[stop].t + seconds + 0.01 * (k + 1), seq + 100 * seconds + k + 1
+            still = [WheelSample(t_s - 0.01 + 0.001 * (j + 1), 0.0, 0.0) for j in range(10)]
+            builder.frame(msgspec.structs.replace(frames[stop], seq=number, t=t_s, enc=still, imu=[]))
+        builder.fix(fix)
+    for frame in frames[stop + 1 : end + 1]:
+        t_s, samples = frame.t + 3.0, [row._replace(t_s=row.t_s + 3.0) for row in frame.enc]
+        builder.frame(msgspec.structs.replace(frame, seq=frame.seq + 300, t=t_s, enc=samples))
+    builder.fix(driven.fixes[1][1])
+    (segment,) = builder.build().segments
+    assert len(segment.right_rad) == end - stop
+    assert segment.duration_s == pytest.approx(0.01 * (end - stop))
 
 
 @pytest.fixture(scope="module")
