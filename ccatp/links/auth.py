@@ -79,7 +79,7 @@ class KeyPair(NamedTuple):
 
 
 def check_key(text: str | bytes) -> str:
-    """Why a text is no CURVE key (32 bytes in Z85, ZeroMQ RFC 32), or nothing. The text itself may be a secret."""
+    """Why a text is not a CURVE key (32 bytes in Z85, ZeroMQ RFC 32), or empty. Does not quote it: it may be secret."""
     try:
         if len(text) == KEY_CHARACTERS:
             z85.decode(text)
@@ -128,7 +128,7 @@ class ClientsFile:
 
     @property
     def clients(self) -> Clients:
-        """The clients listed now; none where the list cannot be read or is malformed, see ``trouble``."""
+        """The clients listed now; none if the list cannot be read or is malformed (``trouble`` says why)."""
         stamp: tuple[int, ...] | None = None
         with suppress(OSError):
             info = self._path.stat()

@@ -22,14 +22,14 @@ Celsius = Annotated[float, Meta(ge=-100.0, le=200.0)]
 
 
 class SteerSample(NamedTuple):
-    """The steering angle as it was read, rad, left positive."""
+    """A reading of the steering angle, rad, left positive."""
 
     t_s: Time
     steer_rad: Angle
 
 
 class RadioSample(NamedTuple):
-    """A radio received: which, how strong, from where (left of the heading; ``None`` without a direction)."""
+    """A received radio: its name, level, and direction (left of the heading; ``None`` without a direction)."""
 
     t_s: Time
     beacon: Name
@@ -40,7 +40,7 @@ class RadioSample(NamedTuple):
 class RadioScan(msgspec.Struct, frozen=True):
     """One turn of a reflector.
 
-    ``step``: between two directions, rad; the first is straight ahead, they go to the left. ``levels``: of each radio,
+    ``step``: angle between two directions, rad, from straight ahead to the left. ``levels``: of each radio,
     dBm, one for each direction, ``None`` where a packet was lost.
     """
 
@@ -50,7 +50,7 @@ class RadioScan(msgspec.Struct, frozen=True):
 
 
 class MoteBurst(NamedTuple):
-    """Pulses from one mote to another, or to the robot: delays after the radio message; the listener's thermometer."""
+    """Pulses from one mote to another or to the robot: delays after the radio message, temperature of the listener."""
 
     t_s: Time
     sender: Name
@@ -79,7 +79,7 @@ _encoder = msgspec.json.Encoder()
 
 
 def decode_beacon_frame(line: bytes) -> BeaconFrame:
-    """The extra keys in a line that has passed as ``sensors``; ``BadLine`` for a wrong type or range."""
+    """The extra keys of a line that is a valid ``sensors`` message; ``BadLine``: wrong type or range."""
     try:
         return _decoder.decode(line)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -114,7 +114,7 @@ class PoseTrack(NamedTuple):
     place_m: FloatArray  # x, y, shape (k, 2)
     heading_rad: FloatArray  # shape (k,)
     covariance: FloatArray  # of x, y, heading, shape (k, 3, 3)
-    reckoned_m: FloatArray  # where dead reckoning alone would see the robot, shape (k, 2)
+    reckoned_m: FloatArray  # x, y by dead reckoning alone, shape (k, 2)
 
     @property
     def sigma_m(self) -> FloatArray:

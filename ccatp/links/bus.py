@@ -1,4 +1,4 @@
-"""What the processes share over ZeroMQ PUB and SUB: single frames of the topic table, their publishers and subscribers.
+"""Messages of the processes over ZeroMQ PUB and SUB: publishers and subscribers of the topics.
 
 In lockstep a loop waits for the message of its frame. The main loop publishes lines, tracks and times in batches.
 """
@@ -31,7 +31,7 @@ from ccatp.links.topics import (
 MAX_MESSAGE_BYTES = 1 << 20
 # A lockstep run publishes some thousand frames a second; this is several seconds of them, about 100 MB at the worst.
 HIGH_WATER_MARK = 50_000
-# A subscriber comes up before its publisher; it should not miss the first messages for long.
+# A subscriber may start before its publisher, and should then connect soon.
 RECONNECT_MS = 10
 _encode = msgspec.json.Encoder().encode
 _decoders = {topic.name.encode(): (topic.name, msgspec.json.Decoder[Any](topic.message)) for topic in TOPICS}
@@ -39,7 +39,7 @@ _prefixes = {topic.name: topic.name.encode() + b" " for topic in TOPICS}
 
 
 class BadMessage(Exception):
-    """A frame on the bus that is not of the topic table."""
+    """A frame on the bus that is no message of a known topic."""
 
 
 def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
@@ -71,7 +71,7 @@ class Publisher:
         self._socket.send(_prefixes[name] + _encode(message), zmq.DONTWAIT)
 
     def has_subscriber(self, name: str) -> bool:
-        """Whether a subscription to a topic has arrived; what is published before is lost to it."""
+        """Whether a subscriber of a topic is connected; what was published before, it does not receive."""
         while True:
             try:
                 change = self._socket.recv(zmq.DONTWAIT)
@@ -86,11 +86,11 @@ class Publisher:
 
 
 class Subscriber:
-    """Receives topics from one or more publishers, which may come up later.
+    """Receives topics from one or more publishers, which may start later.
 
-    ``is_watching``: watch the connection, for ``is_cut``; of one publisher only. ``is_uncounted``: a publisher that
-    waits for its subscribers does not count this one (``has_subscriber``). ``keeps_newest``: of messages that wait only
-    the newest is kept, whatever its topic.
+    ``is_watching``: watch the connection, for ``is_cut``; with one publisher only. ``is_uncounted``: ``has_subscriber``
+    of the publisher does not count this one. ``keeps_newest``: of the waiting messages only the newest one is kept,
+    whatever its topic.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Subscriber:
         if keeps_newest:
             self.socket.setsockopt(zmq.CONFLATE, 1)
         for name in topics:
-            # Every message is an object: with its brace the prefix fits as well, and is not the one that is waited for.
+            # Every message is an object, so a prefix with a brace matches, too, but is not the one of `has_subscriber`.
             self.socket.setsockopt(zmq.SUBSCRIBE, BY_NAME[name].name.encode() + (b" {" if is_uncounted else b" "))
         for endpoint in endpoints:
             self.socket.connect(endpoint)
@@ -139,15 +139,15 @@ class Subscriber:
                 self.bad_messages += 1
 
     def maintain(self) -> None:
-        """Let a new publisher learn the subscriptions; to be called now and then where nothing is received for long.
+        """Send the subscriptions to a new publisher; to be called now and then if nothing is received for long.
 
-        The library sends them from the thread that owns the socket, and only when that calls.
+        libzmq sends them only while the thread that owns the socket calls one of its functions.
         """
         self.socket.getsockopt(zmq.EVENTS)
 
     @property
     def is_cut(self) -> bool:
-        """The publisher was there and is gone, as when its process has died."""
+        """The publisher was connected and is no longer, as after the end of its process."""
         while self._monitor is not None and self._monitor.poll(0):
             event = parse_monitor_message(self._monitor.recv_multipart())["event"]
             self._is_cut = event == zmq.EVENT_DISCONNECTED
@@ -161,11 +161,11 @@ class Subscriber:
         self.socket.close()
 
 
-# In lockstep simulated time stands still while a loop waits; longer than this the other loop hangs.
+# In lockstep simulated time stops while a loop waits. After this time the other loop counts as hanging.
 LOCKSTEP_WAIT_S = 10.0
 # Between slices the heartbeat is sent, and the connection to the other loop is checked.
 WAIT_SLICE_S = 0.02
-# Danger is at most a few frames ahead of main: a number far beyond the present one is of the robot's last boot.
+# Danger is at most a few frames ahead of main: a much larger frame number belongs to the last boot of the robot.
 MAX_FRAMES_AHEAD = 100
 
 
@@ -186,12 +186,12 @@ class PeerSubscriber:
     ) -> None:
         self._subscriber = Subscriber(context, [endpoint], topics, is_watching=True)
         self._on_wait = on_wait
-        # Renews a connection that is silent for long.
+        # Sends subscriptions to a publisher that was restarted.
         self.maintain = self._subscriber.maintain
         self.close = self._subscriber.close
 
     def goes_on_waiting(self, deadline_s: float) -> bool:
-        """Nothing came for a slice: whether the other process is there, and there is time until ``deadline_s``."""
+        """Whether to wait for another slice: the other process is connected, and ``deadline_s`` is not over."""
         if self._subscriber.is_cut or time.monotonic() > deadline_s:
             return False
         self._on_wait()
@@ -199,7 +199,7 @@ class PeerSubscriber:
 
 
 class VerdictSubscriber(PeerSubscriber):
-    """Receives danger's verdicts; ``timeout_s``: an older one is not in force."""
+    """Receives the verdicts of danger; one that is older than ``timeout_s`` is not in force."""
 
     def __init__(
         self,
@@ -226,10 +226,10 @@ class VerdictSubscriber(PeerSubscriber):
         self.verdict = self._early = None
 
     def latest(self, seq: int, frame_s: float, *, is_lockstep: bool) -> Verdict | None:
-        """The verdict in force for frame ``seq``: in lockstep that of the frame before, else the newest that is fresh.
+        """The verdict in force for frame ``seq``: in lockstep that on the frame before, else the newest.
 
-        In lockstep danger judges a frame while main serves it. Where danger did not judge the frame before, the
-        verdict on an earlier one counts as long as it is fresh.
+        ``None`` if it is older than ``timeout_s``. In lockstep danger judges a frame while main serves it. If danger
+        did not judge the frame before, the verdict on an earlier one counts.
         """
         if self._early is not None and self._early.seq < seq:
             self.verdict, self._early = self._early, None
@@ -257,7 +257,7 @@ class VerdictSubscriber(PeerSubscriber):
 
 
 class EstimateSubscriber(PeerSubscriber):
-    """Receives main's estimates; ``is_taking_over``: the one for the first frame may have been missed."""
+    """Receives main's estimates; ``is_taking_over``: that before the first frame may have been missed."""
 
     def __init__(
         self,
@@ -281,10 +281,10 @@ class EstimateSubscriber(PeerSubscriber):
         self._judged_frame = self._judged = self._first_seq = -1
 
     def latest(self, seq: int, *, is_lockstep: bool) -> EstimateMessage | None:
-        """The estimate to judge frame ``seq`` with: in lockstep always the same one, else the newest.
+        """The estimate for the verdict on frame ``seq``: in lockstep always the same one, else the newest.
 
-        Where several waited, after a stall, the newest counts, but the drives of each have moved the wheels:
-        ``commanded`` spans those of all that no frame was judged with.
+        If several waited, after a stall, the newest one counts. Its ``commanded`` includes the set points of all
+        estimates that were not used for a verdict, because their drives have moved the wheels, too.
         """
         if self._first_seq < 0:
             self._first_seq = seq + self._is_taking_over
@@ -298,7 +298,7 @@ class EstimateSubscriber(PeerSubscriber):
                     continue
                 break
             message = received[2]
-            # An estimate for a frame far ahead is of the robot's last boot.
+            # An estimate for a much later frame belongs to the last boot of the robot.
             if isinstance(message, EstimateMessage) and message.seq <= seq + MAX_FRAMES_AHEAD:
                 missed = self._newest if self._newest_seq > self._judged else None
                 self._newest = message if missed is None else message.following(missed)
@@ -349,9 +349,9 @@ class HeartbeatPublisher:
             self.publish()
 
 
-# Frames per batch: a second of them, small enough for the bus and large enough that the cost per frame vanishes.
+# Frames per batch, one second: small enough for the bus, large enough for a small cost per frame.
 BATCH_FRAMES = 100
-# A batch is sent after this much wall time even when it is not full, so that displays stay alive in real time.
+# After this wall time a batch is sent even if it is not full, so that displays are up to date in real time.
 BATCH_WALL_S = 0.25
 
 
@@ -364,7 +364,7 @@ class Telemetry:
     Attributes:
         send: publishes one message of a topic.
         seq, t_s: the newest frame.
-        frames_before: the recorded number of a frame is its ``seq`` and this.
+        frames_before: the recorded number of a frame is its ``seq`` plus this.
         newest_line: of the newest frame with an estimate.
         tick_us: wall times of frames for the next batch.
     """
@@ -387,7 +387,7 @@ class Telemetry:
         self.t_s = 0.0
 
     def continue_numbering(self) -> None:
-        """The robot's frames restarted: recorded numbers go on, as far as the number of frames is known."""
+        """The robot's frames restarted: the recorded numbers continue after the newest known frame."""
         self.frames_before += max(self.seq, 0)
 
     def add_frame(self, seq: int, t_s: float, raw: bytes, row: tuple[Any, ...]) -> None:
@@ -400,14 +400,14 @@ class Telemetry:
             self.flush()
 
     def add_line(self, seq: int, raw: bytes) -> None:
-        """Keep the line alone, of a frame that is not newer than the last one."""
+        """Keep only the line of a frame that is not newer than the last one."""
         self.seq = seq
         self._lines.append(msgspec.Raw(raw))
         if len(self._lines) >= BATCH_FRAMES:
             self.flush()
 
     def flush(self, least_age_s: float = 0.0) -> None:
-        """Publish the batches where the last time is at least so long ago."""
+        """Publish the batches if they were published at least ``least_age_s`` ago."""
         now_s = time.monotonic()
         if now_s - self._flushed_wall_s < least_age_s:
             return

@@ -19,7 +19,7 @@ MAX_NAME_CHARACTERS = 100
 
 
 class BadRequest(ValueError):
-    """A frame that is no request of its channel; the text is the reply's ``error``."""
+    """A frame that is not a request of its channel; the text is the ``error`` of the reply."""
 
 
 class EmergencyRequest(msgspec.Struct, frozen=True, tag_field="cmd", tag="emergency"):
@@ -118,7 +118,7 @@ def parse_reply(frame: bytes) -> dict[str, Any]:
 
 
 def uuid_of(text: str) -> str:
-    """The one form of an id that may be written in many; the id itself is answered as it was sent."""
+    """The canonical form of a UUID; the reply contains the id as it was sent."""
     return str(UUID(text))
 
 
@@ -129,7 +129,7 @@ def _parse_request(frame: bytes) -> dict[str, Any]:
 
 
 def parse_object(frame: bytes) -> dict[str, Any]:
-    """A JSON object without duplicate keys; ``BadRequest``: it is none."""
+    """The JSON object in a text, without duplicate keys; ``BadRequest``: the text is none."""
     try:
         value = json.loads(frame.decode(), object_pairs_hook=_without_duplicates, parse_constant=_refuse_constant)
     except BadRequest:

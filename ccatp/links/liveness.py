@@ -9,14 +9,14 @@ STALE_AFTER_S = min(BY_NAME[f"heartbeat.{name}"].stale_after_s for name in LOOPS
 
 
 class Liveness:
-    """The newest heartbeat of each loop; no heartbeat and no frame of the robot counts after ``stale_after_s``."""
+    """The newest heartbeat of each loop. A heartbeat or frame older than ``stale_after_s`` does not count."""
 
     def __init__(self, stale_after_s: float = STALE_AFTER_S) -> None:
         self._stale_after_s = stale_after_s
         self.heartbeats: dict[str, Heartbeat] = {}
 
     def update(self, heartbeat: Heartbeat) -> None:
-        """Take a heartbeat. Its time is that of the machine's clock: waiting in a queue ages it."""
+        """Take a heartbeat. Its age is that by its own time stamp, so the time in a queue counts."""
         self.heartbeats[heartbeat.process] = heartbeat
 
     @property
@@ -25,7 +25,7 @@ class Liveness:
         return all(name in self.heartbeats and self.heartbeats[name].phase in ("joined", "done") for name in LOOPS)
 
     def trouble(self, now_s: float) -> str:
-        """What is wrong, or nothing."""
+        """What is wrong, or an empty text."""
         for name in LOOPS:
             heartbeat = self.heartbeats.get(name)
             if heartbeat is None:
@@ -41,24 +41,24 @@ class Liveness:
         return ""
 
 
-# Not those in the names of points and addresses: another point is another matter.
+# Not those in the names of points and addresses, which distinguish lines.
 _NUMBER = re.compile(r"(?<![\w./:-])\d+(?:\.\d+)?(?![\w/:-]|\.\d)")
 
 
 def kind_of(text: str) -> str:
-    """The text without its numbers: lines with the same are of one kind."""
+    """The text without its numbers. Lines with equal texts are of one kind."""
     return _NUMBER.sub("#", text)
 
 
 class LogRateLimit:
-    """So many lines in a period, and a count of those that were left out."""
+    """Allows a number of lines in a period, and counts the lines that it suppressed."""
 
     def __init__(self, lines: int, period_s: float) -> None:
         self._lines, self._period_s = lines, period_s
         self._begun_s, self._used, self._left_out = float("-inf"), 0, 0
 
     def take(self, now_s: float) -> int | None:
-        """Ask for a line: how many were left out since the last one, or ``None`` when this one is left out, too."""
+        """The number of lines suppressed since the last allowed one; ``None`` if this line is suppressed, too."""
         if now_s - self._begun_s >= self._period_s:
             self._begun_s, self._used = now_s, 0
         if self._used >= self._lines:
@@ -70,14 +70,14 @@ class LogRateLimit:
 
 
 class RateLimitedLog:
-    """Lines for a terminal: a few of each kind in a period, and how many like it were left out before."""
+    """Lines for a terminal: a few of each kind in a period, with the number of suppressed lines of that kind."""
 
     def __init__(self, lines: int, period_s: float) -> None:
         self._lines, self._period_s = lines, period_s
         self._budgets: dict[str, LogRateLimit] = {}
 
     def take(self, level: str, text: str, now_s: float) -> str | None:
-        """The line to print at a monotonic time; ``None`` where it is left out. Errors are never left out."""
+        """The line to print at a monotonic time; ``None`` if it is suppressed. Errors are never suppressed."""
         if level == "error":
             return text
         budget = self._budgets.setdefault(f"{level} {kind_of(text)}", LogRateLimit(self._lines, self._period_s))

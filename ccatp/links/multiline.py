@@ -16,7 +16,7 @@ EOL = b"\r\n"
 
 
 class BadMultilineRequest(ValueError):
-    """A line that is no request; ``reason`` goes into the error reply."""
+    """A line that is not a request; ``reason`` is sent in the error reply."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(f"not a MultiLine request: {reason}")
@@ -24,7 +24,7 @@ class BadMultilineRequest(ValueError):
 
 
 class BadReply(ValueError):
-    """A line that is no reply."""
+    """A line that is not a reply."""
 
 
 class Command(StrEnum):
@@ -243,7 +243,7 @@ def valid_lengths(data: ChannelData, channels: Sequence[int]) -> tuple[dict[int,
             reasons[channel] = "absent"
         elif record.errors:
             reasons[channel] = "+".join(record.errors)
-        elif not math.isfinite(record.length_mm) or record.length_mm * 1e-3 <= 0.0:  # the smallest numbers vanish
+        elif not math.isfinite(record.length_mm) or record.length_mm * 1e-3 <= 0.0:  # the smallest numbers become zero
             reasons[channel] = f"length {record.length_mm} mm"
         else:
             lengths_m[channel] = record.length_mm * 1e-3

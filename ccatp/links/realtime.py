@@ -14,11 +14,11 @@ import structlog
 
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
-# What a loop uses stays the same from its first minute on, but its free memory crumbles: the heap of main grows by 4
-# MiB in an hour, each page a fault in the middle of a cycle. So much is there from the start, and is never given
-# back.
+# The memory that a loop uses is constant after its first minute, but by fragmentation the heap of main would grow by
+# 4 MiB in an hour, with a page fault in the middle of a cycle for each page. So this much is reserved at the start and
+# never released.
 RESERVE_BYTES = 16 << 20
-# libzmq's threads that move messages; those that write to disk or compute on the side stay behind.
+# libzmq's threads that move messages. Threads that write to disk or compute keep the ordinary scheduling.
 IO_THREADS = "ZMQbg/IO"
 WITHOUT = "reaction times hold while the machine has a core to spare; the robot's own time-to-live holds in any case"
 
@@ -46,7 +46,7 @@ def reserve_heap(size: int) -> None:
     libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, (ctypes.c_size_t,)
     libc.free.argtypes = (ctypes.c_void_p,)
     libc.mallopt(M_TRIM_THRESHOLD, (1 << 31) - 1)
-    libc.mallopt(M_MMAP_MAX, 0)  # a block of this size would be no part of the heap
+    libc.mallopt(M_MMAP_MAX, 0)  # larger blocks would not be taken from the heap
     block = libc.malloc(size)
     libc.mallopt(M_MMAP_MAX, 1 << 16)  # glibc's own number
     if block is not None:

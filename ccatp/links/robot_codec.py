@@ -1,7 +1,7 @@
 """Codec of the robot link (interface control document 1): JSON lines between the robot and its clients.
 
-Decoding is strict: numbers are finite and in range, no key stands twice, booleans are no numbers. Unknown keys are
-ignored, a message of an unknown type is no bad line. Nothing of a bad line is used.
+Decoding is strict: numbers must be finite and in range, keys must be unique, booleans are not numbers. Unknown keys are
+ignored. A message of an unknown type is not a bad line. Nothing of a bad line is used.
 """
 
 import hashlib
@@ -46,8 +46,8 @@ class BadLine(ValueError):
         self.message_type = message_type
 
 
-# Number of keys of the messages whose keys are all required. When all of them are there, a line with exactly this many
-# colons has no other key and none twice: every key brings a colon of its own.
+# Number of keys of the messages whose keys are all required. If a line has all of them and exactly this many colons, it
+# has no other key and no key twice, because every key has a colon.
 _KEYS: dict[type, int] = {Sensors: 15, Drive: 5, Permit: 6, Fans: 3}
 _MAX_INTEGER_DIGITS = 400
 _NAMES_NOT_FINITE = {"nan": "NaN", "inf": "Infinity", "-inf": "-Infinity"}
@@ -90,7 +90,7 @@ def decode_from_client(line: bytes) -> FromClient | Unknown:
 class RobotFrame(RobotLinkMessage, tag="sensors", omit_defaults=True):
     """A frame as it is encoded: the fields of ``Sensors`` in the same places, samples as plain tuples (finite, SI).
 
-    Making named tuples of twenty samples takes as long as reading them, so it waits until names are needed.
+    Named tuples of twenty samples take as long to make as to read, so they are made only where names are needed.
     """
 
     seq: int
@@ -149,7 +149,7 @@ def join_mac(key: bytes, nonce: str, role: str) -> str:
 
 
 def is_mac_right(key: bytes, nonce: str, join: Join) -> bool:
-    """Whether a join carries the code that belongs to key, nonce and role; takes the same time for every wrong one."""
+    """Whether the code of a join is that of key, nonce and role; the time does not depend on where it differs."""
     return hmac.compare_digest(join_mac(key, nonce, join.role).encode(), join.mac.lower().encode())
 
 
@@ -165,7 +165,7 @@ def _unknown_or_bad(line: bytes, reason: str, known: frozenset[str]) -> Unknown:
 
 
 def _check_keys(line: bytes) -> Any:
-    """Read the whole line slowly: no key twice, every number finite, also where the fast decoder skips."""
+    """Check the whole line, with keys that the fast decoder skips: no key twice, every number finite."""
     try:
         value = json.loads(line.decode("utf-8"), object_pairs_hook=_object, parse_int=_integer)
         place = _place_not_finite(value)
@@ -179,7 +179,7 @@ def _check_keys(line: bytes) -> Any:
 
 
 def _place_not_finite(value: Any, place: str = "") -> str:
-    """Where the first number is that JSON does not have, and what it is; or nothing."""
+    """Place and text of the first number that is not JSON; empty if there is none."""
     if isinstance(value, float):
         return "" if math.isfinite(value) else f"{place or 'the line'} is {_NAMES_NOT_FINITE[str(value)]}"
     if isinstance(value, dict):
@@ -199,7 +199,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _integer(text: str) -> int:
-    # As a float it would be infinite: what is a number to one reader must not be none to the next.
+    # As a float it would be infinite. All readers must agree on whether it is a valid number.
     if len(text) > _MAX_INTEGER_DIGITS or not math.isfinite(float(text)):
         raise BadLine("integer of too many digits")
     return int(text)
@@ -209,13 +209,13 @@ MAX_LINE_BYTES = 8192
 
 
 class LineTooLong(ValueError):
-    """A line over the limit; the session that sent it is of no further use."""
+    """A line over the limit; its session cannot continue."""
 
 
 class LineBuffer:
-    """Cuts a byte stream into lines, however it was chopped on its way.
+    """Splits a byte stream into lines, whatever the pieces in which it arrives.
 
-    ``limit``: most bytes of a line, its LF not counted. No more than this is ever kept between two calls.
+    ``limit``: largest number of bytes of a line without its LF. No more than this is kept between two calls.
 
     Attributes:
         error: set from the first line on, finished or not, that is over the limit.
@@ -243,7 +243,7 @@ class LineBuffer:
 
 
 class BadLineLimit:
-    """So many lines at once, so many a second in the long run; more is a flood."""
+    """Allows a number of lines at once and a rate in the long run; more is a flood."""
 
     def __init__(self, lines: float, rate_hz: float) -> None:
         self._lines = self._left = lines
@@ -251,7 +251,7 @@ class BadLineLimit:
         self._then_s = 0.0
 
     def take(self, lines: int, now_s: float) -> bool:
-        """Take lines at ``now_s``; false when there are not so many left."""
+        """Count lines at ``now_s``; false if they exceed the limit."""
         self._left = min(self._lines, self._left + self._rate_hz * (now_s - self._then_s)) - lines
         self._then_s = now_s
         return self._left >= 0.0

@@ -33,11 +33,12 @@ from ccatp.links.robot_messages import (
 )
 from ccatp.links.robot_messages import Fans as FansMessage
 
-# Commands wait in the kernel or not at all: what piles up here is stale before it arrives.
+# Commands may wait in the kernel only: if they waited here, they would be too old on arrival.
 MAX_UNSENT_BYTES = 4096
-# A dead peer is noticed within seconds: unacknowledged data for 1000 ms, or silence for 1 s and 3 probes of 1 s.
-# A robot in real time that sends more lines than this is flooding us. What piles up while the link is stuck may come at
-# once: half a minute of frames, which is as long as a stall may last; then three times what it should send.
+# Options of TCP to detect a dead peer within seconds: unacknowledged data for 1000 ms, or silence for 1 s and 3 probes
+# of 1 s each are enough (LINUX_OPTIONS).
+# A robot in real time that sends more lines than this floods the link. After a stall all waiting frames may arrive at
+# once, those of half a minute, the longest stall; otherwise three times the frame rate is allowed.
 BACKLOG_S = 30.0
 FLOOD_FACTOR = 3.0
 LINUX_OPTIONS = {"TCP_USER_TIMEOUT": 1000, "TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
@@ -152,7 +153,7 @@ class RobotLink(asyncio.Protocol):
         """Connect and join. A link is used once: for another session make another.
 
         ``RobotTimeout``: it took longer; ``RobotRefused``: the robot refused; ``WrongProtocol``: another protocol, or
-        no robot at all; ``RobotLinkError``: no answer, or the connection ended.
+        the peer is not a robot; ``RobotLinkError``: no answer, or the connection ended.
         """
         loop = asyncio.get_running_loop()
         joining: asyncio.Future[Hello] = loop.create_future()
@@ -239,7 +240,7 @@ class RobotLink(asyncio.Protocol):
             self._answer(message, joining)
         elif isinstance(message, Joined) and self._hello is not None and message.role == self._role:
             self._is_joined = True
-            if not self._hello.lockstep:  # there it is we who set the pace
+            if not self._hello.lockstep:  # in lockstep the client sets the frame rate
                 rate_hz = self._hello.frame_hz
                 self._budget = BadLineLimit(BACKLOG_S * rate_hz, FLOOD_FACTOR * rate_hz)
             joining.set_result(self._hello)

@@ -1,7 +1,4 @@
-"""The messages of the robot link (interface control document 1) as types; their codec is ``ccatp.links.robot_codec``.
-
-Lines out of a byte stream with a hard limit, and the count of bad ones.
-"""
+"""The messages of the robot link (interface control document 1); their codec is ``ccatp.links.robot_codec``."""
 
 from typing import Annotated, Literal
 
@@ -16,7 +13,7 @@ AUTH_HMAC: Literal["hmac-sha256"] = "hmac-sha256"
 
 Role = Literal["controller", "monitor"]
 RefusalReason = Literal["role taken", "bad mac", "bad join", "bad protocol", "busy"]
-Sequence53 = Annotated[int, Meta(ge=0, le=2**53 - 1)]  # what every JSON reader keeps exact
+Sequence53 = Annotated[int, Meta(ge=0, le=2**53 - 1)]  # largest integer that every JSON reader represents exactly
 Steer = Annotated[float, Meta(ge=-1.6, le=1.6)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Length = Annotated[float, Meta(ge=-10.0, le=10.0)]
@@ -25,7 +22,7 @@ Name = Annotated[str, Meta(max_length=64)]
 
 
 class Unknown(msgspec.Struct, frozen=True):
-    """A well-formed message of a type that this side does not know."""
+    """A well-formed message of an unknown type."""
 
     type: str
 
@@ -35,7 +32,7 @@ class RobotLinkMessage(msgspec.Struct, tag_field="type", gc=False):
 
 
 class VehicleData(msgspec.Struct):
-    """What a robot among beacons says besides: its kind, and its distance sensors, rad, left of the heading."""
+    """Further data of a robot among beacons: its kind; directions of its distance sensors, rad, left of the heading."""
 
     kind: Literal["ackermann", "differential"]
     axle_distance_m: Positive
@@ -44,7 +41,7 @@ class VehicleData(msgspec.Struct):
 
 
 class RobotData(msgspec.Struct, omit_defaults=True):
-    """What the robot says of itself: lengths in m, robot frame; edge sensors in the order of ``EdgeSample``."""
+    """Data of the robot: lengths in m, robot frame; edge sensors in the order of ``EdgeSample``."""
 
     wheel_radius_m: Positive
     wheel_base_m: Positive
@@ -100,7 +97,7 @@ class CommandEcho(msgspec.Struct, gc=False):
 
 
 class Sensors(RobotLinkMessage, tag="sensors", gc=True, omit_defaults=True):
-    """One frame of the robot: every sample taken since the one before, oldest first. Times are the robot's clock, s.
+    """One frame of the robot: all samples since the frame before, oldest first. Times by the robot's clock, s.
 
     ``sliding``: it has found a loss of grip itself, holds its wheels, and gives full fans.
     """

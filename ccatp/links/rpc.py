@@ -23,7 +23,7 @@ from ccatp.links.channels import BadRequest, format_error, parse_reply
 Handler = Callable[..., bytes | Awaitable[bytes]]
 """Takes the request, and on TCP the client's public key (Z85); returns the reply or an awaitable of it."""
 
-# libzmq cuts off a peer whose frame is longer than this; what lies between it and the limit of a request is answered.
+# libzmq disconnects a peer whose frame is longer than this; a shorter one over the limit of a request gets an answer.
 MAX_FRAME_BYTES = 1 << 13
 MAX_REPLY_BYTES = 1 << 20
 HIGH_WATER_MARK = 64
@@ -33,7 +33,7 @@ MAX_CONNECTIONS = 32
 BACKLOG = 16
 # A connection whose ZeroMQ handshake, with its key where one is required, takes longer is closed.
 HANDSHAKE_MS = 2000
-# A peer that is gone without closing its connection gives its place back.
+# Detects a peer that vanished without closing its connection, to end its connection.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 5000, 15000
 # An emergency is sent again at this period: where every other message is lost, fourteen leave 1 in 10,000 unreported.
 REPEAT_S = 0.05
@@ -53,9 +53,9 @@ class RequestFailed(DaemonUnreachableError):
 class Router:
     """Serves single-frame requests of REQ and DEALER peers.
 
-    Use as an async context manager around ``serve``; a ``RouterError`` where the endpoint may not or cannot be bound.
-    While a handler's later reply is awaited, others are served. An exception of the handler ends ``serve``. Without
-    ``keys`` the endpoint is ``ipc://`` or ``inproc://``; with them it is ``tcp://ADDRESS:PORT`` for CURVE clients that
+    Use as an async context manager around ``serve``; ``RouterError``: the endpoint may not or cannot be bound.
+    Requests are served while the awaitable of another one is pending. An exception of the handler ends ``serve``.
+    Without ``keys`` the endpoint is ``ipc://`` or ``inproc://``; with them it is ``tcp://ADDRESS:PORT`` for CURVE clients that
     a ``ZapHandler`` admits. ``bound``: the endpoint as bound, with its port. ``refused``: requests that never reached
     the handler. ``turned_away``: connections beyond ``MAX_CONNECTIONS``.
     """
@@ -117,7 +117,7 @@ class Router:
                 elif len(self._pending) >= MAX_PENDING:
                     await self._refuse(envelope, BUSY)
                 else:
-                    # Only its owner reaches a socket in the runtime directory: without keys there is no client id.
+                    # Without keys there is no client id: only the owner can connect in the runtime directory.
                     client = () if self._keys is None else (str(frames[-1].get("User-Id")),)
                     answer = self._handler(payload, *client)
                     if isinstance(answer, bytes):
@@ -153,9 +153,9 @@ class Router:
 
 
 def turn_away(descriptor: int, endpoint: str) -> bool:
-    """End a connection that libzmq has accepted at an endpoint, as if the peer had closed it; whether it was done.
+    """End a connection that libzmq has accepted at an endpoint, as if the peer had closed it; returns whether it did.
 
-    ``descriptor`` is from the socket monitor. It may be closed or reused by now; another endpoint's is left alone.
+    ``descriptor`` is from the socket monitor. It may be closed or reused by now; one of another endpoint is not closed.
     """
     with contextlib.suppress(OSError):  # closed, or not a socket
         own = os.dup(descriptor)  # cannot be reused before it is closed
@@ -233,7 +233,7 @@ class ZapHandler(Authenticator):
 
     Use as an async context manager around ``serve``, and enter it before the ``Router`` of the same context; after it
     no client is admitted. pyzmq's ``AsyncioAuthenticator`` is not used: its own task would hide an exception, and
-    refuse everybody afterwards.
+    refuse all clients afterwards.
     """
 
     def __init__(

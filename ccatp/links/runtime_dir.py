@@ -14,9 +14,9 @@ from ccatp.errors import ConfigError, RefusedError
 LOCK_FILE = "lock"
 # Held by the simulated robot that publishes its truth there.
 TRUTH_LOCK_FILE = "truth.lock"
-# In the usual folder, each the folder of a simulation that began while another daemon ran.
+# Folders in the usual folder: each of a simulation that began while another daemon ran.
 BESIDE = "sim-{}"
-# A process that asks whether a lock is held has it for an instant.
+# A process that checks whether a lock is held holds it for an instant.
 _SECOND_LOOK_S = 0.05
 
 # sockaddr_un.sun_path holds 108 bytes with its closing zero on Linux.
@@ -26,7 +26,7 @@ MAX_SOCKET_NAME_BYTES = 24
 
 
 def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
-    """The folder, which need not exist: the configured one, or the first that the environment offers.
+    """Path of the folder, which need not exist: the configured one, or the first that the environment names.
 
     ``configured`` (``run.runtime_dir``) unless empty, else ``$CCATP_RUNTIME_DIR``, else ``$XDG_RUNTIME_DIR/ccatp``,
     else ``ccatp-<uid>`` in the temporary directory. ``ConfigError``: the path is too long for a unix socket in it.
@@ -53,7 +53,7 @@ def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
 
 
 def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
-    """The folder, made with mode 0700 when it is missing, and checked to be the caller's own.
+    """The folder, made with mode 0700 if it is missing; it must belong to the caller.
 
     ``ConfigError``: it cannot be made, is not a folder, belongs to another user or is writable for others.
     """
@@ -63,7 +63,7 @@ def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
 
 
 def make_own_dir(path: Path, option: str, forbidden: int) -> None:
-    """Make a folder with mode 0700, or check that it is the caller's own, without the ``forbidden`` bits of a mode.
+    """Make a folder with mode 0700, or check that it belongs to the caller and has no ``forbidden`` bits in its mode.
 
     ``option`` names the folder on the command line. ``ConfigError``: it cannot be made, or may not be used.
     """
@@ -83,13 +83,13 @@ def make_own_dir(path: Path, option: str, forbidden: int) -> None:
 
 
 def running_in(usual: Path) -> list[Path]:
-    """The folders in which a daemon runs: the usual one, and those of simulations beside it."""
+    """The folders in which a daemon runs: the usual one, and those of further simulations."""
     return [folder for folder in (usual, *sorted(usual.glob(BESIDE.format("*")))) if is_held(folder / LOCK_FILE)]
 
 
 @contextmanager
 def locked(path: Path, refusal: str, wait_s: float = _SECOND_LOOK_S) -> Iterator[int]:
-    """Hold the lock of a file for as long as the block lasts; it ends with the process, whatever ends that.
+    """Hold the lock of a file during the block; the end of the process releases it in any case.
 
     Yields the file's descriptor: processes that inherit it hold the lock, too. ``RefusedError``: another process still
     holds it after ``wait_s``.
@@ -113,7 +113,7 @@ def is_held(path: Path) -> bool | None:
 
 
 def remove_sockets(runtime_dir: Path, names: Iterable[str]) -> None:
-    """Remove sockets that no process serves any more; what is no socket stays."""
+    """Remove sockets that no process serves any more; other files remain."""
     for name in names:
         path = runtime_dir / name
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""What a process tells its service manager, by the datagrams of ``sd_notify(3)``."""
+"""Notifications to the service manager, by the datagrams of ``sd_notify(3)``."""
 
 import contextlib
 import os
@@ -29,7 +29,7 @@ class Notifier:
 
 
 def watchdog_period_s(environ: Mapping[str, str]) -> float | None:
-    """Period in which the service manager expects ``WATCHDOG=1`` from this process; ``None`` where it does not."""
+    """Period in which the service manager expects ``WATCHDOG=1`` from this process; ``None``: it does not."""
     text = environ.get(WATCHDOG_USEC, "")
     if environ.get(WATCHDOG_PID, str(os.getpid())) != str(os.getpid()) or not text.isdecimal() or int(text) == 0:
         return None
@@ -37,7 +37,7 @@ def watchdog_period_s(environ: Mapping[str, str]) -> float | None:
 
 
 def is_journal(descriptor: int, environ: Mapping[str, str]) -> bool:
-    """Whether what is written to a descriptor goes to the journal, which keeps it and shows it to others."""
+    """Whether a descriptor is connected to the journal, which others can read."""
     with contextlib.suppress(OSError):  # closed
         info = os.fstat(descriptor)
         return environ.get("JOURNAL_STREAM") == f"{info.st_dev}:{info.st_ino}"

@@ -1,6 +1,6 @@
-"""THE topic table: everything the processes share over ZeroMQ; ``ccatp.links.bus`` is its codec.
+"""The topic table: all messages of the processes over ZeroMQ; ``ccatp.links.bus`` is its codec.
 
-Liveness, recording and displays are derived from the table; a new topic is a row. Levels are repeated at their rate.
+Liveness, recording and displays use the table; a new topic needs one row. Levels are repeated at their rate.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Message(msgspec.Struct, kw_only=True):
 
 
 class Heartbeat(Message):
-    """A process is alive, before and while frames flow.
+    """Shows that a process is alive, with and without frames.
 
     ``phase``: starting, ready (the other loop may join), joined, rejoining (the link is lost), done. ``frame_age_s``:
     wall time since the process served its newest sensors frame, ``None`` before the first. ``t_s`` is of the machine's
@@ -33,7 +33,7 @@ class Heartbeat(Message):
 
 
 class EstimateMessage(Message):
-    """The localizer's pose after frame ``seq``, deck frame, and what main had the wheels do.
+    """The localizer's pose after frame ``seq``, deck frame, and the set points that main sent to the wheels.
 
     ``commanded``: lowest and highest set point of the right wheel, then of the left one, rad/s, over the drives sent
     since the last estimate. ``drive_seq``: number of the newest of them. ``grip``: full thrust over the least that
@@ -50,7 +50,7 @@ class EstimateMessage(Message):
     grip: float = 0.0
 
     def following(self, missed: "EstimateMessage") -> "EstimateMessage":
-        """This estimate for one who has not looked at the one before: ``commanded`` spans the drives of both."""
+        """This estimate for a receiver that has not used the one before: ``commanded`` includes the drives of both."""
         mine, its = self.commanded, missed.commanded
         if mine is None or its is None:
             return self  # an unknown span stays unknown
@@ -65,7 +65,7 @@ class Alarm(msgspec.Struct, kw_only=True):
     """One row of the list of alarms; times are UTC, empty where it has not happened."""
 
     name: str  # of the condition, see docs/alarms.md
-    severity: SeverityName  # the worst so far
+    severity: SeverityName  # the highest so far
     cause: str
     advice: str
     since: str
@@ -93,17 +93,17 @@ class MissionStatus(Message):
     since_s: float = 0.0  # robot time at which the state began
     outcome: str = ""
     lower_bound_s: float = 0.0
-    exit_status: int = -1  # what the run ends with; -1 while it goes on
+    exit_status: int = -1  # of the run; -1 until it ends
     missed_deadlines: int = 0  # frames that were served late, in real time
     worst_lateness_ms: float = 0.0
     left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
     friction: float = 0.0  # of the tyres, by the creep of turns; 0: not measured
     grip: float = 0.0  # full thrust over the least that holds the robot on all of the mirror with it
-    alarms: list[Alarm] = []  # the gravest first, those that ended last
+    alarms: list[Alarm] = []  # the highest severity first, ended ones last
 
 
 class DisplayState(Message):
-    """The newest of everything that a display shows (pose: deck frame), published while a client has asked for it."""
+    """The newest values for a display (pose: deck frame), published while there is a subscriber."""
 
     x_m: float
     y_m: float
@@ -112,25 +112,25 @@ class DisplayState(Message):
     heading_sigma_rad: float
     nis: float  # normalised innovation squared of the filter's last update
     size: int  # its degrees of freedom; 0 for none
-    line: msgspec.Raw  # the newest of the robot, as it came
+    line: msgspec.Raw  # the newest line of the robot
 
 
 class RobotShape(msgspec.Struct, omit_defaults=True):
-    """One thing on the map, in the plane of the pose; it has the same ``id`` in the next message."""
+    """An object on the map, in the plane of the pose; its ``id`` is the same in all messages."""
 
     id: str
-    kind: str  # its look: beacon, obstacle, target, robot, trail; a display draws others plainly
+    kind: str  # for its symbol: beacon, obstacle, target, robot, trail; others get a default symbol
     x_m: float
     y_m: float
     covariance_m2: tuple[float, float, float] | None = None  # of x and y: xx, xy, yy; drawn as its ellipse
     heading_rad: float | None = None
     radius_m: float | None = None
-    outline_m: list[tuple[float, float]] = []  # a line, closed where the first point comes again
+    outline_m: list[tuple[float, float]] = []  # a line; closed if the last point is the first one
     label: str = ""
 
 
 class Scene(Message):
-    """What is on the map besides the mirror and the robot; each message has all of it."""
+    """All objects on the map besides the mirror and the robot."""
 
     shapes: list[RobotShape]
 
@@ -158,10 +158,10 @@ class ArrivalMessage(Message):
 
 
 class FixMessage(Message):
-    """A fix taken after frame ``seq``, world frame; without a point it only finds the robot."""
+    """A fix taken after frame ``seq``, world frame; without a point it only localizes the robot."""
 
     point: tuple[int, int, int] | None
-    is_fused: bool  # or refused: doubted and measured again, or of no use
+    is_fused: bool  # false: refused, because it is doubted and measured again or cannot be used
     position_m: tuple[float, float, float]
     covariance_m2: list[float]
     dop: float
@@ -172,18 +172,19 @@ class FixMessage(Message):
 
 
 class Rest(Message):
-    """The mission takes the robot to be at rest from frame ``seq`` on."""
+    """For the mission the robot is at rest from frame ``seq`` on."""
 
 
 TreatmentKind = Literal["begun", "doubted", "odometry_off", "odometry_on"]
 
 
 class Treatment(Message):
-    """What the localizer is treated with from frame ``seq`` on, besides samples and fixes.
+    """An input of the localizer besides samples and fixes, from frame ``seq`` on.
 
-    ``begun``: it begins again before this frame, values are x (m), y (m), heading (rad), deck frame, and the standard
-    deviations of place (m) and heading (rad); ``doubted``: after the samples of this frame its pose may be wrong by so
-    much, m and rad; ``odometry_off``: from here on wheels and inertial unit are not used, the robot stands.
+    ``begun``: it starts again before this frame; values: x (m), y (m), heading (rad), deck frame, and the standard
+    deviations of position (m) and heading (rad). ``doubted``: after the samples of this frame its covariance is
+    inflated; values: standard deviations, m and rad. ``odometry_off``: wheels and inertial unit are not used, the robot
+    stands; ``odometry_on``: they are used again.
     """
 
     kind: TreatmentKind
@@ -191,9 +192,9 @@ class Treatment(Message):
 
 
 class DangerEvent(Message):
-    """The verdict's code, cause or severity changed; without a cause all is well again.
+    """The verdict's code, cause or severity changed; without a cause nothing is found any more.
 
-    ``active``: all that danger finds, what the verdict says included: name of the condition, cause, severity.
+    ``active``: all findings of danger, that of the verdict included: name of the condition, cause, severity.
     """
 
     code: int
@@ -206,7 +207,7 @@ class DangerEvent(Message):
     active: list[tuple[str, str, int]] = []
 
 
-# Of log lines. The event of one that is also shown to the operator; the field ``text`` holds it.
+# Event of log lines that are also shown to the operator; their field ``text`` is shown.
 LEVELS = {"info": 20, "warning": 30, "error": 40}
 OPERATOR_MESSAGE = "operator_message"
 
@@ -236,7 +237,7 @@ class TruthMessage(Message):
 
 
 class Misalignment(Message):
-    """How the simulated panels really lie (simulation only): row, column, piston_m, tip_rad, tilt_rad."""
+    """True misalignment of the simulated panels (simulation only): row, column, piston_m, tip_rad, tilt_rad."""
 
     panels: list[tuple[int, int, float, float, float]]
 
@@ -261,18 +262,18 @@ class BeaconMapMessage(Message):
     pose_ellipse: BeaconEllipse
     beacons: dict[str, BeaconEllipse]  # each radio or mote on the map
     target: BeaconEllipse | None  # the radio that is followed; None before it was received
-    obstacles: list[tuple[float, float]]  # points in the room that the distance sensors saw lately
+    obstacles: list[tuple[float, float]]  # points of the room that the distance sensors measured recently
     waypoints: list[tuple[float, float]]
-    next_waypoint: int  # the one driven to, -1 for none
+    next_waypoint: int  # the present target, -1 for none
     distances: list[float]
     nis_sum: float  # of all readings so far
     nis_size: int  # their degrees of freedom
     refused: int  # readings that the gate refused
-    notes: dict[str, float]  # what the mission has to say of the map: phases, errors expected
+    notes: dict[str, float]  # of the mission about the map: phases, expected errors
 
 
 class BeaconArrival(Message):
-    """A waypoint is reached, by the estimate: number in the loop and lap, both from 0, its place, the estimate."""
+    """A waypoint was reached by the estimate: its number and the lap, both from 0, its position, the estimate."""
 
     waypoint: int
     lap: int
@@ -290,7 +291,7 @@ class BeaconTruth(Message):
 
 
 class BeaconPlaces(Message):
-    """Where radios and motes really are (simulation only), m."""
+    """True positions of radios and motes (simulation only), m."""
 
     places: dict[str, tuple[float, float]]
 
@@ -299,7 +300,7 @@ class BeaconPlaces(Message):
 class Topic:
     """One row of the table."""
 
-    name: str  # as it stands before the JSON
+    name: str  # prefix of the JSON
     message: type[Message] | type[Verdict]
     publisher: str
     rate_hz: float  # nominal; 0 for an event
@@ -334,7 +335,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("beacon_truth", BeaconTruth, "dataloop", 1.0, 0.0, True),
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
-# Danger carries a pose on by the wheels itself: a pose in five frames is fresh enough and costs a fifth.
+# Danger advances the pose by the wheels itself, so a pose in every fifth frame is enough.
 ESTIMATE_FRAMES = 5
 
 
