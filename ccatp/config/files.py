@@ -1,4 +1,4 @@
-"""Files that a user names: read within bounds, written at once; the file of a traceback."""
+"""Files that a user names: read up to a limit, written atomically; the file of a traceback."""
 
 import errno
 import os
@@ -16,7 +16,7 @@ FOR_OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
 
 def open_input(path: Path) -> BinaryIO:
-    """Open a regular file, which neither waits for a writer nor goes on for ever, whatever stands at that path.
+    """Open a regular file; a pipe or device, which may wait or be endless, is refused.
 
     Raises OSError: there is none, or it is a folder, a pipe, a socket or a device.
     """
@@ -82,7 +82,7 @@ def read_key(key_file: str, *, must_be_private: bool = False, what: str = "robot
 
 
 def write_file(path: Path, text: str, mode: int | None = None, *, is_replacing: bool = True) -> None:
-    """Write a file at once: a reader finds all of it or the old one, also after a power cut.
+    """Write a file atomically: a reader finds the new content or the old one, also after a power failure.
 
     ``mode``: that of the old file by default. Where ``path`` is a link, what it points to is replaced. Raises
     ConfigError: it cannot be written, or is there and not to be replaced.
@@ -125,7 +125,7 @@ def write_durably(path: Path, data: bytes) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """A file was made or replaced: keep its name through a power cut."""
+    """Make the name of a new or replaced file durable against a power failure."""
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)

@@ -1,4 +1,4 @@
-"""Reads configurations: the default file, the user's, the command line, laid over each other; edits single keys."""
+"""Reads configurations from the default file, the user's file and the command line; edits single keys."""
 
 import difflib
 import json
@@ -70,7 +70,7 @@ class ConfigSource:
     root: Key = ()
 
     def depth(self, key: Key) -> int:
-        """How many parts of a key this source holds."""
+        """Number of parts of a key that this source contains."""
         inside = len(self.root)
         return inside + depth_in(self.tree, key[inside:]) if key[:inside] == self.root else 0
 
@@ -126,7 +126,7 @@ def _layers(base: str, file: Path | None, overrides: Overrides, *, any_ports: bo
 
 
 def _strongest(sources: list[ConfigSource], *keys: Key) -> tuple[ConfigSource, Key]:
-    """The key, of those that contradict each other, that stands nearest to the user, and the source that holds it."""
+    """Of contradicting keys the one from the strongest source, and this source."""
     held: list[tuple[ConfigSource, Key]] = []
     for key in keys:
         depths = [source.depth(key) for source in sources]
@@ -135,13 +135,13 @@ def _strongest(sources: list[ConfigSource], *keys: Key) -> tuple[ConfigSource, K
 
 
 def _place(sources: list[ConfigSource], *keys: Key) -> str:
-    """``file:line`` of the key that stands nearest to the user."""
+    """``file:line`` of the key from the strongest source."""
     source, key = _strongest(sources, *keys)
     return source.place(key)
 
 
 def _value(tree: object, *key: str) -> Any:
-    """What stands at a key; ``None`` where nothing does."""
+    """Value of a key; ``None`` if there is none."""
     for part in key:
         tree = tree.get(part) if isinstance(tree, Mapping) else None
     return tree
@@ -150,7 +150,7 @@ def _value(tree: object, *key: str) -> Any:
 def validated(model: type[M], tree: Tree, sources: list[ConfigSource], check: Check[M] = lambda _: ()) -> M:
     """The values of a tree as a model; ConfigError: one line with file, line, key, what is wrong and what to do."""
     try:
-        # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
+        # through JSON, for which strict mode fits TOML: an array is a tuple, "1" is not a number
         cfg = model.model_validate_json(json.dumps(tree, default=str), strict=True)
     except ValidationError as error:
         problems = list(islice(faults_of(error.errors(include_url=False), model), _MOST_PROBLEMS + 1))

@@ -61,7 +61,7 @@ def parse_toml(text: str, name: str) -> dict[str, Any]:
 
 
 def depth_in(tree: Any, key: Key) -> int:
-    """How many parts of a key a tree holds; all of them where it holds a value in place of a section."""
+    """Number of parts of a key that a tree contains; all of them if it has a value in place of a section."""
     for depth, part in enumerate(key):
         is_list_of_tables = isinstance(tree, list) and all(isinstance(one, Mapping) for one in tree)
         known = range(len(tree)) if is_list_of_tables else tree
@@ -82,7 +82,7 @@ def find_line(text: str, key: Key) -> int | None:
 
     def is_there(count: int) -> bool:
         nonlocal searched
-        # A beginning of the text that ends within a value is no TOML: the value's last line decides about its first.
+        # A text that ends within a value is not TOML, so the last line of the value belongs to it, too.
         for end in range(count, len(lines)):
             beginning = "\n".join(lines[:end])
             searched += len(beginning)
@@ -105,7 +105,7 @@ def format_key(key: Key) -> str:
 
 
 def format_value(value: object) -> str:
-    """One value as it stands in a message, shortened."""
+    """A value for a message, shortened."""
     text = repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False, default=str)
     return one_line(text, _SHOWN)
 

@@ -4,18 +4,18 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-# No quantity of this project is larger, in whatever unit its key names.
+# Larger than all quantities of this project, in the units of their keys.
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 NonNegative = Annotated[float, Field(ge=0.0, le=1e6)]
 # No decision is made on data older than 150 ms.
 Freshness = Annotated[float, Field(gt=0.0, le=0.15)]
 Port = Annotated[int, Field(ge=0, le=65535)]
-PeerPort = Annotated[int, Field(ge=1, le=65535)]  # at which somebody listens
+PeerPort = Annotated[int, Field(ge=1, le=65535)]  # of a server; 0 is not allowed
 Seed = Annotated[int, Field(ge=0, lt=2**63)]  # an integer of TOML
 Pair = tuple[float, float]
 TEXT, HOST = r"^[^\x00-\x1f\x7f-\x9f]*$", r"^([^\s./\x00-\x1f\x7f-\x9f]{1,63}(\.|$))+$"
 URL = r"^(https?://[^\s\x00-\x20\x7f-\x9f]+)?$"
-# What the values must be that match these.
+# Descriptions of the patterns, for messages.
 PATTERNS = {
     URL: "must be empty or an address that begins with http:// or https://",
     TEXT: "must not contain control characters",
@@ -32,7 +32,7 @@ class Model(BaseModel):
 
 
 class ProcessesConfig(Model):
-    """The processes of a run: where they meet, and when one hangs."""
+    """The processes of a run: folder of their sockets, and when one counts as hanging."""
 
     runtime_dir: Text  # empty = chosen from the environment
     realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
@@ -55,7 +55,7 @@ class RunConfig(ProcessesConfig):
 
 
 class SurveyMetadata(Model):
-    """Who measured what with which instruments; acts on nothing. Empty = not given."""
+    """Who measured what with which instruments; without effect. Empty = not given."""
 
     telescope: Text
     operator: Text
@@ -150,7 +150,7 @@ class ControlConfig(Model):
 
 
 class TechniquesConfig(Model):
-    """What the full-state localizer uses; each may be switched off to see what it gives."""
+    """Parts of the full-state localizer; each may be switched off to see its effect."""
 
     zero_velocity: bool
     rest_biases: bool
@@ -184,7 +184,7 @@ class FullStateConfig(Model):
     turn_creep_scatter_share: NonNegative
     turn_creep_aside: NonNegative
     turn_loss_per_creep: NonNegative
-    wander_fraction: NonNegative  # of the scatter from leg to leg: how much slip and creep wander within one
+    wander_fraction: NonNegative  # of the scatter from leg to leg: change of slip and creep within a leg
     wander_time_s: Positive
     edge_sigma_m: Positive
     line_gate: Positive
@@ -270,9 +270,9 @@ class DangerConfig(Model):
 
 
 class LightConfig(Model):
-    """How light meets a mirror, world frame."""
+    """The light that falls on a mirror, world frame."""
 
-    direction_world: tuple[float, float, float]  # in which it goes, at the origin of the mirror frame; any length
+    direction_world: tuple[float, float, float]  # of propagation, at the origin of the mirror frame; any length
     vergence_1_m: NonNegative  # 1 over the distance from that origin to where its rays meet; 0 = parallel light
 
 
@@ -286,7 +286,7 @@ class AlignConfig(Model):
 
 
 class HealthConfig(Model):
-    """What the monitors of sensors, wheels, fans and link take for a fault, and how long they are patient."""
+    """Limits and times of the monitors of sensors, wheels, fans and link."""
 
     slow_speed_m_s: Positive
     slow_rate_rad_s: Positive
@@ -342,7 +342,7 @@ class HealthConfig(Model):
 
 
 class ObservatoryConfig(Model):
-    """The observatory channel over TCP, beside the unix socket that is always there."""
+    """The observatory channel over TCP, in addition to the unix socket, which always exists."""
 
     endpoint: Text  # empty = none
     key_file: Text
@@ -350,7 +350,7 @@ class ObservatoryConfig(Model):
 
 
 class AlarmsConfig(Model):
-    """Where alarms are reported besides page, terminal and log."""
+    """Further reports of alarms, besides page, terminal and log."""
 
     webhook_url: Annotated[str, Field(max_length=2048, pattern=URL)]
     webhook_timeout_s: Positive
@@ -363,7 +363,7 @@ class DashboardConfig(Model):
     enabled: bool
     host: Host
     port: Port
-    token_file: Text  # empty = a token that each start makes
+    token_file: Text  # empty = a new token at each start
     host_names: tuple[Text, ...]
     rate_hz: Annotated[float, Field(gt=0.0, le=50.0)]
     max_connections: Annotated[int, Field(ge=8, le=512)]  # a browser opens up to six
@@ -499,12 +499,12 @@ class SurfaceConfig(Model):
 
 
 class FrameConfig(Model):
-    """Where the mirror frame stands in the world: p_mirror = R (p_world - origin)."""
+    """Pose of the mirror frame in the world: p_mirror = R (p_world - origin)."""
 
     origin_world_mm: tuple[float, float, float]
     rotation_about_x_rad: float
     reflecting_side_sign: Literal[-1, 1]
-    # Unit vector along which things fall. Files of older versions lack it: they are of a telescope at the zenith.
+    # Unit vector of gravity. Files of older versions do not have it: they are of a telescope at the zenith.
     gravity_world: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
@@ -538,7 +538,7 @@ class BaseConfig(Model):
 class CollimatorsConfig(Model):
     """Surveyed collimator positions of the laser system, world frame."""
 
-    # a position has three unknowns, and one length is to spare: interface control document 2
+    # a position has three unknowns, and one more length is needed: interface control document 2
     channels: Annotated[tuple[Annotated[int, Field(ge=1, le=32)], ...], Field(min_length=4)]
     positions_world_mm: tuple[tuple[float, float, float], ...]
 

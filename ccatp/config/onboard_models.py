@@ -23,7 +23,7 @@ class OnboardLinkConfig(Model):
 
 
 class OnboardRobotConfig(Model):
-    """What the hello says of the robot; lengths in m, robot frame."""
+    """Data of the robot in the hello; lengths in m, robot frame."""
 
     wheel_radius_m: Positive
     wheel_base_m: Positive
@@ -52,7 +52,7 @@ class WheelServoConfig(Model):
 
 
 class EdgeThresholdConfig(Model):
-    """When an analogue edge sensor sees the panel."""
+    """The threshold of an analogue edge sensor over a panel."""
 
     threshold_v: Positive
     hysteresis_v: NonNegative

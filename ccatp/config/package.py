@@ -15,7 +15,7 @@ def configs_dir(root: Path = ROOT) -> Path:
 
 
 def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment in which ``python -m ccatp...`` runs this package, whatever lies in the working directory."""
+    """The environment in which ``python -m ccatp...`` runs this package, whatever the working directory contains."""
     changed = {**environment, "PYTHONSAFEPATH": "1"}
     above = str(ROOT.parent)
     if above not in sys.path[1:]:  # neither installed nor in PYTHONPATH: it was found in the working directory

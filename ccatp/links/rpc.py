@@ -53,9 +53,9 @@ class RequestFailed(DaemonUnreachableError):
 class Router:
     """Serves single-frame requests of REQ and DEALER peers.
 
-    Use as an async context manager around ``serve``; ``RouterError``: the endpoint may not or cannot be bound.
-    Requests are served while the awaitable of another one is pending. An exception of the handler ends ``serve``.
-    Without ``keys`` the endpoint is ``ipc://`` or ``inproc://``; with them it is ``tcp://ADDRESS:PORT`` for CURVE clients that
+    Use as an async context manager around ``serve``; ``RouterError``: the endpoint may not or cannot be bound. Requests
+    are served while the awaitable of another one is pending. An exception of the handler ends ``serve``. Without
+    ``keys`` the endpoint is ``ipc://`` or ``inproc://``; with them it is ``tcp://ADDRESS:PORT`` for CURVE clients that
     a ``ZapHandler`` admits. ``bound``: the endpoint as bound, with its port. ``refused``: requests that never reached
     the handler. ``turned_away``: connections beyond ``MAX_CONNECTIONS``.
     """

@@ -1,1 +1,1 @@
-"""What a run leaves on disk: mission database, checkpoint, MCAP recording, log, and summary."""
+"""Files of a run: mission database, checkpoint, MCAP recording, log, and summary."""

@@ -1,8 +1,8 @@
-"""The checkpoint beside the mission's database: what one main loop leaves to the next.
+"""The checkpoint beside the mission's database: the state of one main loop for the next one.
 
-Two slots in one file, written in turn, each with a checksum and a count: whatever instant the writer dies at, one of
-them is whole. A place is left to the kernel, which keeps it when the process dies; what an operator or the observatory
-decided is synchronised to the disk, by a thread: neither may keep the control loop waiting.
+The file has two slots, written in turn, each with a checksum and a count. So one of them is complete at whatever
+instant the writer ends. A pose is written to the kernel, which keeps it if the process ends. A decision of an operator
+or of the observatory is synchronised to the disk by a thread. Neither delays the control loop.
 """
 
 import os
@@ -17,7 +17,7 @@ from ccatp.config.files import read_input
 from ccatp.errors import UsageError
 
 FILE = "checkpoint"
-# Of a file with a hole between the slots. A record that is longer takes the older one with it, and is whole.
+# Offset of the second slot. A longer record overwrites the older one, and is complete itself.
 _SLOT_BYTES = 65536
 _HEAD_BYTES = 8  # length and checksum of count and record
 _COUNT_BYTES = 8
@@ -26,17 +26,17 @@ AT_BASE = "so the robot's place is not known; set it at base, remove this file a
 
 
 class CheckpointError(UsageError):
-    """There is a checkpoint that cannot be read: the robot's place has to be set by hand."""
+    """The checkpoint cannot be read, so the operator has to give the robot's pose."""
 
 
 class CheckpointFile:
     """Writes records; ``failure``: why the last one could not be written, or empty.
 
-    ``is_patient``: simulated time waits for the writer, so that a place may be written at once and not by the thread.
+    ``is_patient``: simulated time waits for the writer, so records are written at once and not by the thread.
     """
 
     def __init__(self, path: Path, *, is_patient: bool) -> None:
-        # It gets its name with its first record: an empty file is one that has lost its content.
+        # It is named with its first record, so an empty file has lost its content.
         self._path, self._is_named = path, path.exists()
         self._fd = os.open(path if self._is_named else _unnamed(path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self.failure = ""

@@ -1,7 +1,7 @@
 """Telemetry of a run as an MCAP file: JSON messages with a JSON schema for every channel; and its readers.
 
-Chunks are small and none is held back for long, so that a ``kill -9`` costs the last moment at most; the reader takes a
-file that ends anywhere. Recording never disturbs a mission: the first write that fails ends it, with one report.
+Chunks are small and written soon, so ``kill -9`` loses at most the last moment. The reader accepts a file that ends
+anywhere. Recording never disturbs a mission: the first write that fails ends the recording, with one report.
 """
 
 import json
@@ -32,8 +32,8 @@ from ccatp.links.runtime_dir import is_held
 TELEMETRY = "telemetry.mcap"
 RUN_LOCK = ".lock"  # in a run directory; held by the daemon that writes there
 CHUNK_BYTES = 16 * 1024
-FLUSH_AFTER_S = 1.0  # of message time: slow topics do not wait for a full chunk
-HELD_BACK_S = 0.25  # of the machine's time: nor does anything else
+FLUSH_AFTER_S = 1.0  # of message time: so long a slow topic waits for a full chunk
+HELD_BACK_S = 0.25  # of the machine's time: so long any message waits
 MAGIC = b"\x89MCAP0\r\n"
 # Errors of the format's reader on damaged bytes.
 DAMAGE = (
@@ -55,14 +55,14 @@ _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _LAST_OPCODE = max(opcode.value for opcode in Opcode)
 _METADATA = "ccatp"
 _SIMULATION = "simulation"
-_MAX_T_S = 1e9  # thirty years of uptime: anything beyond is not a time since boot
+_MAX_T_S = 1e9  # thirty years: a larger time is not a time since boot
 _NS = 1e9
 _CLOCK_BACK_S = 10.0  # batches and events are this much out of order at most
 _COMPARED_S, _UTC_OFF_NS = 10.0, 20_000_000
 
 
 class RobotClock:
-    """UTC of the robot's clock: compared at its first time, and again where it went back because the robot started.
+    """UTC of the robot's clock: compared at its first time, and again if it went back because the robot restarted.
 
     Of a real robot they are compared every ``_COMPARED_S``, and UTC is corrected where it is off by ``_UTC_OFF_NS``. In
     a simulation UTC advances with the robot's clock, in lockstep faster than the clock of this machine.
@@ -70,7 +70,7 @@ class RobotClock:
 
     def __init__(self, *, is_simulation: bool, now_ns: Callable[[], int] = time.time_ns) -> None:
         self._is_simulation, self._now_ns = is_simulation, now_ns
-        self._zero_ns = self._least_ns = 0  # UTC when the robot's clock was 0: in force, and by the promptest message
+        self._zero_ns = self._least_ns = 0  # UTC at time 0 of the robot: in force, and by the least delay
         self._newest_s = self._compared_s = 0.0
 
     def utc_ns(self, t_s: float) -> int:
@@ -100,7 +100,7 @@ class RecordedMessage(NamedTuple):
 
 
 class _ChunkIndexes:
-    """The records of the chunks that end the file, until then on the disk: those of a day take hundreds of megabytes.
+    """The index records of the chunks, kept on disk until the file ends: a day has hundreds of megabytes.
 
     The MCAP writer keeps a list of them, adds to it and iterates over it once.
     """
@@ -117,7 +117,7 @@ class _ChunkIndexes:
         yield self
 
     def write(self, builder: RecordBuilder) -> None:
-        """Write all of them, as each would write itself."""
+        """Write all of them."""
         self._file.seek(0)
         while part := self._file.read(_COPIED_BYTES):
             builder.write(part)
@@ -185,7 +185,7 @@ class Recorder:
             self._file.flush()  # a chunk that was full
 
     def flush_if_due(self) -> None:
-        """To be called several times a second: what waits for a full chunk does not wait for long."""
+        """Write a chunk that has waited too long to be full; to be called several times a second."""
         waiting_s = 0.0 if self._waiting_since_s is None else time.monotonic() - self._waiting_since_s
         if self.is_recording and waiting_s >= HELD_BACK_S:
             with self._ending_at_a_failure():
@@ -208,7 +208,7 @@ class Recorder:
     def _ending_at_a_failure(self) -> Iterator[None]:
         try:
             yield
-        except Exception as error:  # whatever it is, the mission is worth more than its recording
+        except Exception as error:  # any error: the mission is more important than its recording
             self.is_recording = False
             with suppress(OSError):
                 self._files.close()
@@ -253,8 +253,8 @@ class Condition:
 def scan(path: Path, condition: Condition) -> Iterator[McapRecord]:
     """The intact records of a file, chunks broken up. Raises ``OSError`` where it cannot be read.
 
-    A chunk carries a checksum, so a damaged one is left out. Where the lengths are damaged, the next chunk is found by
-    how it begins, and taken if its checksum is right.
+    A chunk has a checksum, so a damaged one is left out. If the lengths are damaged, the next chunk is found by its
+    first bytes, and used if its checksum is right.
     """
     condition.size_bytes = path.stat().st_size
     if not condition.size_bytes:
@@ -269,7 +269,8 @@ def scan(path: Path, condition: Condition) -> Iterator[McapRecord]:
             end = _end_of_record(data, at)
             records = None if end is None else _parsed(data, at, end)
             if end is None or records is None:
-                # A record that is whole but for its contents is followed by another; otherwise one has to be searched.
+                # If only the content of a record is damaged, another one follows it; otherwise the next one is searched
+                # for.
                 is_framed = end is not None and (data[end:] == MAGIC or _end_of_record(data, end) is not None)
                 after = end if is_framed and end is not None else _next_chunk(data, at + 1)
                 condition.lose(at, after)
@@ -322,7 +323,7 @@ def iter_logged(
 ) -> Iterator[tuple[int | None, RecordedMessage]]:
     """All messages of a file in the order of recording, up to its end or to the first damage.
 
-    Before each stands UTC minus the robot's clock, ns since 1970; None in recordings up to format 2.
+    Each comes with UTC minus the robot's clock, ns since 1970; None in recordings up to format 2.
 
     The file may end anywhere, as after a ``kill -9``; a damaged chunk gives none of its messages. ``on_damage`` is
     called with the reason where the file ends early or is damaged. ``OSError``: the file cannot be read.

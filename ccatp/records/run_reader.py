@@ -34,7 +34,7 @@ class Marked(NamedTuple):
     sensors: Sensors
     at_rest: bool
     begun: tuple[float, ...] | None = None  # before the frame it was reset, with these values of ``Treatment``
-    is_odometry_off: bool = False  # whatever wheels and inertial unit report, the robot stands
+    is_odometry_off: bool = False  # the robot stands; wheels and inertial unit are not used
     doubted: tuple[float, ...] | None = None  # after the samples its uncertainty was increased by this, m and rad
 
 
@@ -55,11 +55,11 @@ def _fixed(message: topics.FixMessage) -> Fixed:
 
 
 def in_order(messages: Iterable[Message]) -> Iterator[Event]:
-    """Frames, rests, treatments and fixes in the order in which the localizer met them.
+    """Frames, rests, treatments and fixes in the order in which the localizer received them.
 
-    Frames are recorded in batches, rests and fixes at once and with the number of their frame: they come at any time
-    before the batch of the frame after it. A rest and a treatment belong into their frame, a fix behind it. Fixes
-    behind a frame beyond the end of the record are left out. ``messages`` are in the order of recording.
+    Frames are recorded in batches; rests and fixes at once, with the number of their frame, so they precede the batch
+    of the next frame. A rest and a treatment belong into their frame, a fix after it. Fixes after a frame beyond the
+    end of the record are left out. ``messages`` are in the order of recording.
     """
     rests: set[int] = set()
     treatments: dict[tuple[int, str], tuple[float, ...]] = {}
@@ -144,7 +144,7 @@ def trace_of_truth(rows: Sequence[Sequence[float]] | FloatArray) -> Trace:
 _T = TypeVar("_T")
 CONFIG = "config.toml"
 STORE = "mission.sqlite"
-# Topics that a replay needs; the others of the topic table would be decoded for nothing.
+# Topics that a replay needs; the others are not decoded.
 READ = frozenset(("sensors", "rest", "treatment", "fix", "track", "truth", "arrival"))
 
 
@@ -267,7 +267,7 @@ def _readable(path: Path, read: Callable[[Path], _T]) -> _T:
 
 
 class Survey(NamedTuple):
-    """A run's survey; ``injected``: how the simulated panels lie, None on a real robot or where not recorded."""
+    """A run's survey; ``injected``: simulated misalignment of the panels, None on a real robot or if not recorded."""
 
     cfg: Config
     planned: tuple[PointId, ...]
