@@ -278,7 +278,7 @@ class EstimateSubscriber(PeerSubscriber):
     def reset(self) -> None:
         """The robot's frames restarted: forget the estimate."""
         self._newest: EstimateMessage | None = None
-        self._judged_frame = self._judged = self._first_seq = -1
+        self._newest_seq = self._judged_frame = self._judged = self._first_seq = -1
 
     def latest(self, seq: int, *, is_lockstep: bool) -> EstimateMessage | None:
         """The estimate for the verdict on frame ``seq``: in lockstep always the same one, else the newest.
@@ -302,13 +302,10 @@ class EstimateSubscriber(PeerSubscriber):
             if isinstance(message, EstimateMessage) and message.seq <= seq + MAX_FRAMES_AHEAD:
                 missed = self._newest if self._newest_seq > self._judged else None
                 self._newest = message if missed is None else message.following(missed)
+                self._newest_seq = message.seq
         if seq > self._judged_frame:  # an older one is not judged
             self._judged_frame, self._judged = seq, self._newest_seq
         return self._newest
-
-    @property
-    def _newest_seq(self) -> int:
-        return -1 if self._newest is None else self._newest.seq
 
 
 PERIOD_S = 0.1
