@@ -155,7 +155,7 @@ def read_pair(path: Path, what: str) -> KeyPair:
 
 
 def read_public(path: Path, what: str) -> bytes:
-    """The public key in a file, secret or not; errors as of ``read_pair``."""
+    """The public key in a file, secret or not; ``ConfigError``: it cannot be read, or holds no valid key."""
     return _load(path, what, 0, PUBLIC_SUFFIX)[0]
 
 

@@ -107,7 +107,7 @@ _COVARIANCE = [5, 6, 8, 6, 7, 9, 8, 9, 10]  # stored as xx, xy, yy, xh, yh, hh
 
 
 class PoseTrack(NamedTuple):
-    """Estimates of k frames, in the frame of the room."""
+    """Estimates of k frames, as in the topic ``beacon_track``."""
 
     seq: FloatArray  # shape (k,)
     t_s: FloatArray  # robot time, shape (k,)

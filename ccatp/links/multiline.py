@@ -1,7 +1,8 @@
-"""Codec of the MultiLine online interface, both sides: requests, replies, channel records, line splitting.
+"""Codec of the MultiLine online interface, both sides: requests, replies, channel records.
 
 ASCII, one request or reply a line, closed by CR LF; a bare LF is taken too. ``_`` separates the name of a reply, its
-records and its server error, ``,`` separates fields. Lengths are millimetres on the wire and metres past this module.
+records and its server error, ``,`` separates fields. Lengths are millimetres on the wire and in ``ChannelRecord``;
+``valid_lengths`` gives metres.
 """
 
 import math

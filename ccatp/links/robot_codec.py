@@ -227,7 +227,7 @@ class LineBuffer:
         self.error: LineTooLong | None = None
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Whole lines, without their LF, after ``data`` was appended; none from one over the limit on."""
+        """Whole lines, without their LF, after ``data`` was appended; up to one over the limit: see ``error``."""
         if self._rest:
             data = self._rest + data
         lines = data.split(b"\n")
@@ -267,7 +267,7 @@ class BadLineCounter:
 
     @property
     def first_reason(self) -> str:
-        """Reason of the oldest line of the window."""
+        """Reason of the oldest bad line that is kept."""
         return self._lines[0][1] if self._lines else ""
 
     def add(self, now_s: float, reason: str) -> bool:

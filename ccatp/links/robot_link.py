@@ -35,12 +35,11 @@ from ccatp.links.robot_messages import Fans as FansMessage
 
 # Commands may wait in the kernel only: if they waited here, they would be too old on arrival.
 MAX_UNSENT_BYTES = 4096
-# Options of TCP to detect a dead peer within seconds: unacknowledged data for 1000 ms, or silence for 1 s and 3 probes
-# of 1 s each are enough (LINUX_OPTIONS).
 # A robot in real time that sends more lines than this floods the link. After a stall all waiting frames may arrive at
 # once, those of half a minute, the longest stall; otherwise three times the frame rate is allowed.
 BACKLOG_S = 30.0
 FLOOD_FACTOR = 3.0
+# A dead peer is detected within seconds: by unacknowledged data for 1000 ms, or by silence for 1 s and 3 probes of 1 s.
 LINUX_OPTIONS = {"TCP_USER_TIMEOUT": 1000, "TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
 
 
