@@ -173,9 +173,9 @@ class KalmanFilter:
         if expected is None:
             daxpy(z, rows.V_flat, z.size, 1.0, 0, 1, n, n + 1)
         else:
-            residual = z - expected
-            z = residual - rows.residual  # as if the model were linear
-            rows.residual[...] = residual
+            nu = z - expected
+            z = nu - rows.residual  # the reading of the linear model H x with the same residual
+            rows.residual[...] = nu
         residual = rows.residual.tolist()
         if rows.is_many:
             return self._rotate(rows, residual, R)

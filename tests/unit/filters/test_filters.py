@@ -102,6 +102,18 @@ def test_a_noise_that_is_no_covariance_is_found_out_where_it_is_measured(H: Floa
     np.testing.assert_array_equal(kf.covariance, before[1])
 
 
+@pytest.mark.parametrize("negative", [1.0, 2e-4])  # the first of two subtractions finds it, or the second
+@pytest.mark.parametrize("is_full", [False, True])
+def test_a_covariance_that_is_none_is_refused_in_either_subtraction(negative: float, is_full: bool) -> None:
+    kf = KalmanFilter(np.zeros(2), 1e-12 * EYE)
+    kf.predict(EYE, np.ones((2, 2)) + negative * (1.0 - EYE))
+    before, noise = state(kf), np.full(2, 1e-5)
+    with pytest.raises(FilterDiverged, match="covariance is not positive semidefinite"):
+        kf.update(np.ones(2), EYE, np.diag(noise) if is_full else noise)
+    np.testing.assert_array_equal(kf.mean, before[0])
+    np.testing.assert_array_equal(kf.covariance, before[1])
+
+
 @pytest.mark.parametrize("variance", [0.0, -1.0, np.nan])
 def test_noise_without_a_variance_is_refused(variance: float) -> None:
     with pytest.raises(FilterDiverged, match="update is not finite"):
