@@ -113,11 +113,11 @@ class Condition:
     def found(self, signal: str, value: float, limit: float, **varies: str) -> "MonitorFinding":
         """The finding that the condition applies: ``value`` against ``limit``; ``varies``: parts of the message."""
         cause = self.text(**varies) if varies else self.message
-        return MonitorFinding(self, self.severity, cause, signal, value, limit)
+        return MonitorFinding(self, self.severity, cause, signal, value, limit, self.full_fans)
 
 
 class MonitorFinding(NamedTuple):
-    """A condition that applies; ``value`` in the unit of ``limit``. While it lasts, severity and cause may change."""
+    """A condition that applies, at present; ``value`` in the unit of ``limit``."""
 
     condition: Condition
     severity: Severity
@@ -125,6 +125,7 @@ class MonitorFinding(NamedTuple):
     signal: str
     value: float
     limit: float
+    full_fans: bool = False
 
     def verdict(self, seq: int, t_s: float, code: EventCode) -> Verdict:
         """The verdict on frame ``seq``, which permits no motion."""

@@ -7,32 +7,31 @@ precedes normal operation (0). The cause is that of the most restrictive rule.
 * An edge declared: code 1, no motion towards a sensor that hangs over the edge, no turn except back.
 * The robot's centre about to cross the rim of the map: likewise (``ccatp.safety.edge_rule``).
 * Edge samples, encoder samples or the estimate missing or too old: no motion permitted, the code stays. This ends by
-  itself as soon as they are fresh again.
+  itself as soon as they are fresh again; after missing encoder samples only with a fix.
 * An emergency: code 2, latched, motion permitted because the robot shall drive home
   (``ccatp.safety.emergency_latch``). In an earthquake no motion is permitted until it is cleared.
 
-The monitors of ``ccatp.safety.monitor`` check every frame. The finding of the highest severity gives the verdict its
-cause, and any finding that holds the wheels denies all motion. A declared edge keeps its code, and its cause as long as
-nothing holds the wheels.
+The monitors of ``ccatp.safety.monitor`` check every frame. Each finding of a frame counts: any one that holds the
+wheels denies all motion, and that of the highest severity gives the verdict its severity and its cause. A declared edge
+keeps its code, and its cause as long as nothing holds the wheels.
 """
 
 from collections.abc import Sequence
 from math import isfinite
-from typing import Any
 
 import msgspec
 
 from ccatp import conditions
 from ccatp.conditions import MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.core import Corner, EdgeSample, EventCode, Severity, SteadyTime, Verdict, WheelSample
+from ccatp.core import Corner, EdgeSample, EventCode, SteadyTime, Verdict, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.emergency_latch import EmergencyRules
-from ccatp.safety.escalation import SeverityEscalation, denies, gravest
+from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
 from ccatp.safety.monitor import HealthMonitor
 
 CORNERS = tuple(Corner)
@@ -108,14 +107,16 @@ class DangerMonitor(EmergencyRules):
         edges.step(samples, known)
         if samples:
             self._edge_t_s = samples[-1][0]
-        missing = self._samples_missing(t_s) or lost
+        missing = self._samples_missing(t_s)
+        if lost is not None:
+            missing = [*missing, lost]
         found: Sequence[MonitorFinding] = ()
         if board is not None:
             if known is None and estimate is not None and isfinite(estimate.t_s):
                 board.take_commands(estimate.t_s, estimate)
             found = self._look(board, sensors, t_s, wheels, samples)
         self.found = ()
-        if not found and missing is None and edges.is_idle and not origin.direction and not self.latch.is_latched:
+        if not found and not missing and edges.is_idle and not origin.direction and not self.latch.is_latched:
             self.verdict = verdict = Verdict(seq, sensors.t, _NORMAL, "", "", 0.0, 0.0, True, True, True)
             if board is not None and self._escalation.is_counting:
                 self._escalation.escalate(t_s, [])
@@ -123,7 +124,7 @@ class DangerMonitor(EmergencyRules):
             verdict = self._arbitrate(seq, sensors.t, missing)
             if board is not None:
                 self.found = self._escalation.escalate(t_s, [*found, *self._own_findings(missing)])
-                verdict = self._weigh(verdict, self.found)
+                verdict = with_findings(verdict, self.found)
             self.verdict = verdict = self.latch.with_emergencies(verdict)
         return verdict
 
@@ -158,8 +159,8 @@ class DangerMonitor(EmergencyRules):
         slack_m = cfg.gap_tolerance_m + cfg.seam_extra_m + cfg.map_sigmas * known.sigma_m
         return self._map.has_edge_near(self._place(known, sensor), slack_m)
 
-    def _own_findings(self, missing: MonitorFinding | None) -> list[MonitorFinding]:
-        found = [] if missing is None else [missing]
+    def _own_findings(self, missing: Sequence[MonitorFinding]) -> list[MonitorFinding]:
+        found = [*missing]
         if self._health is None:
             return found
         if self._edges.is_lifted:
@@ -181,22 +182,6 @@ class DangerMonitor(EmergencyRules):
             episode.is_doubted = all(others) and not is_over_rim
         return episode.is_doubted
 
-    def _weigh(self, verdict: Verdict, found: Sequence[MonitorFinding]) -> Verdict:
-        top = gravest(found)
-        if top is None:
-            return verdict
-        holds = denies(found)
-        changes: dict[str, Any] = {"full_fans": any(finding.condition.full_fans for finding in found)}
-        if holds:
-            changes |= {"forward": False, "reverse": False, "turn": False}
-        is_kept = verdict.code is EventCode.NEAR_EDGE or (
-            verdict.code is EventCode.ABORTED and top.severity < Severity.RETURN
-        )
-        if not verdict.cause or not is_kept or (holds and top.severity > Severity.PAUSE):
-            value, limit = float(top.value), float(top.limit)
-            changes |= {"cause": top.cause, "signal": top.signal, "value": value, "limit": limit}
-        return msgspec.structs.replace(verdict, severity=top.severity, **changes)
-
     # -- what is missing ------------------------------------------------------------------------------------------
 
     def stale(self, seq: int, t_s: float) -> Verdict:
@@ -212,16 +197,20 @@ class DangerMonitor(EmergencyRules):
     def _denied(self, seq: int, t_s: float, finding: MonitorFinding) -> Verdict:
         return self.latch.with_emergencies(finding.verdict(seq, t_s, self.code))
 
-    def _samples_missing(self, t_s: float) -> MonitorFinding | None:
-        limit_s = self._cfg.stale_after_s
-        if self._edge_t_s is None:
-            return conditions.NO_EDGE_SAMPLES.found("edge", limit_s, limit_s)
-        age_s = abs(t_s - self._edge_t_s)
-        if not age_s <= limit_s:
-            return conditions.EDGE_STALE.found("edge", age_s, limit_s)
+    def _samples_missing(self, t_s: float) -> Sequence[MonitorFinding]:
+        """Findings about each silent sensor. A pause for one must not hide the hold for another."""
+        limit_s, edge_t_s = self._cfg.stale_after_s, self._edge_t_s
         silent_s = self._edges.track.silence_s(t_s)
-        # Without wheel samples the robot's motion is not known.
-        return conditions.ENCODERS_STALE.found("enc", silent_s, limit_s) if silent_s > 0.0 else None
+        if edge_t_s is not None and abs(t_s - edge_t_s) <= limit_s and silent_s <= 0.0:
+            return ()
+        found = []
+        if edge_t_s is None:
+            found.append(conditions.NO_EDGE_SAMPLES.found("edge", limit_s, limit_s))
+        elif not (age_s := abs(t_s - edge_t_s)) <= limit_s:
+            found.append(conditions.EDGE_STALE.found("edge", age_s, limit_s))
+        if not silent_s <= 0.0:  # without wheel samples the robot's motion is not known
+            found.append(conditions.ENCODERS_STALE.found("enc", silent_s, limit_s))
+        return found
 
     def _estimate_missing(self, t_s: float, estimate: EstimateMessage | None) -> MonitorFinding | None:
         limit_s = self._cfg.estimate_stale_after_s
@@ -240,7 +229,8 @@ class DangerMonitor(EmergencyRules):
     def _declared(self) -> EdgeDetector | None:
         return next((e for e in self._edges.episodes if e is not None and e.phase is EdgePhase.DECLARED), None)
 
-    def _arbitrate(self, seq: int, t_s: float, missing: MonitorFinding | None) -> Verdict:
+    def _arbitrate(self, seq: int, t_s: float, findings: Sequence[MonitorFinding]) -> Verdict:
+        missing = gravest(findings)
         if self._edges.is_lifted:
             shown = conditions.ALL_OFF.message, "edge", 4.0, 3.0
             return Verdict(seq, t_s, EventCode.NEAR_EDGE, *shown, False, False, False, EVERYWHERE)

@@ -117,11 +117,11 @@ class BeaconSafetyRules(EmergencyRules):
         if estimate is not None:
             self._state, self._state_seq = estimate.state, estimate.seq
         hold = self._hold(sensors.t, estimate)
+        verdict = self._near(sensors)
         if hold is not None:
-            verdict = self._held(sensors, hold)
+            verdict = self._held(sensors, hold, verdict.code)
         else:
             self._held_since_s = None
-            verdict = self._near(sensors)
         self.code = verdict.code
         if verdict.signal:
             self._denials[verdict.signal] += 1
@@ -190,13 +190,13 @@ class BeaconSafetyRules(EmergencyRules):
             return POSITION_UNCERTAIN.found("position", min(estimate.sigma_m, 1e9), limit_m)
         return None
 
-    def _held(self, sensors: Sensors, hold: MonitorFinding) -> Verdict:
+    def _held(self, sensors: Sensors, hold: MonitorFinding, code: EventCode) -> Verdict:
         if self._held_since_s is None:
             self._held_since_s = sensors.t
         held_s = sensors.t - self._held_since_s
         if held_s > self._danger.hold_limit_s:
             hold = hold._replace(severity=Severity.FAULT, cause=f"{hold.cause} for {held_s:.0f} s")
-        return hold.verdict(sensors.seq, sensors.t, self._unmoved_code)
+        return hold.verdict(sensors.seq, sensors.t, code)
 
     @property
     def _unmoved_code(self) -> EventCode:

@@ -1,12 +1,15 @@
 """Findings of the monitors: how long they last, which one takes precedence, and when their severity is raised."""
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import inf
+from typing import Any
+
+from msgspec.structs import replace
 
 from ccatp.conditions import PRECEDENCE, MonitorFinding
 from ccatp.config.models import HealthConfig
-from ccatp.core import Severity
+from ccatp.core import EventCode, Severity, Verdict
 
 
 class FindingLatch:
@@ -19,9 +22,14 @@ class FindingLatch:
         self.finding: MonitorFinding | None = None
 
     def see(self, t_s: float, finding: MonitorFinding) -> None:
-        """Take evidence at ``t_s``. The first finding is kept unless the new one is more severe."""
-        if self.finding is None or finding.severity > self.finding.severity:
+        """Take evidence at ``t_s``. The first finding stays unless this is more severe; full fans for either."""
+        kept = self.finding
+        if kept is None:
             self.finding = finding
+        elif finding.severity > kept.severity:
+            self.finding = finding._replace(full_fans=finding.full_fans or kept.full_fans)
+        elif finding.full_fans and not kept.full_fans:
+            self.finding = kept._replace(full_fans=True)
         self._seen_s = t_s
 
     def settle(self, t_s: float) -> MonitorFinding | None:
@@ -60,6 +68,28 @@ def gravest(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
 def denies(findings: Iterable[MonitorFinding]) -> bool:
     """Whether any finding holds the wheels. A RETURN, although more severe than a hold, does not."""
     return any(finding.severity in _DENYING for finding in findings)
+
+
+def with_findings(verdict: Verdict, findings: Sequence[MonitorFinding]) -> Verdict:
+    """The verdict with all findings of its frame: the highest severity, and the denials and fans of each.
+
+    The event code stays. The cause becomes that of the most severe finding, except that a declared edge keeps its cause
+    until something holds the wheels, and an emergency until a return or a fault is found.
+    """
+    top = gravest(findings)
+    if top is None:
+        return verdict
+    holds = denies(findings)
+    changes: dict[str, Any] = {"full_fans": any(finding.full_fans for finding in findings)}
+    if holds:
+        changes |= {"forward": False, "reverse": False, "turn": False}
+    is_kept = verdict.code is EventCode.NEAR_EDGE or (
+        verdict.code is EventCode.ABORTED and top.severity < Severity.RETURN
+    )
+    if not verdict.cause or not is_kept or (holds and top.severity > Severity.PAUSE):
+        value, limit = float(top.value), float(top.limit)
+        changes |= {"cause": top.cause, "signal": top.signal, "value": value, "limit": limit}
+    return replace(verdict, severity=top.severity, **changes)
 
 
 class SeverityEscalation:

@@ -163,7 +163,7 @@ ROWS = [
     Row(rows.SENSOR_TOO_SLOW, always(edge=1), cause=SLOW_EDGES, signal="edge"),
     Row(rows.SENSOR_MUCH_TOO_SLOW, lambda frame: {"enc": frame.seq % 5 == 0}, drives, SLOW_ENCODERS, "enc"),
     Row(rows.ENCODER_BROKEN, always(rates=(SPEED_RAD_S, 0.0), noise=0.0), cause="the right encoder is frozen"),
-    Row(rows.WHEEL_RUNS_AWAY, always(rates=(0.0, 8.0)), cause="the left wheel runs away", lasts=False),
+    Row(rows.WHEEL_RUNS_AWAY, always(rates=(SPEED_RAD_S, 8.0)), drives, cause="the left wheel runs away", lasts=False),
     Row(rows.WHEELS_STAND, always(rates=(0.0, 0.0)), drives, signal="encoders", lasts=False),
     Row(rows.ENCODER_COUNTS_NOTHING, always(rates=(0.0, SPEED_RAD_S)), drives, signal="encoder_right", lasts=False),
     Row(
@@ -259,7 +259,7 @@ def test_a_sensor_that_is_silent_is_not_slow() -> None:
     for begin_s in (2.0, 3.0, 4.0):
         seen += scripted.run(begin_s - 0.05, always(edge=0, enc=0, imu=0)) + scripted.run(begin_s + 0.5)
     causes = {verdict.cause for verdict in seen}
-    assert rows.EDGE_STALE.message in causes
+    assert rows.ENCODERS_STALE.message in causes
     assert "deliver" not in "".join(causes)
 
 
