@@ -245,6 +245,10 @@ DRIVES_LATE = slow(Group.LINK, "drives reach the wheels late",
 CLOCK_JUMPED = pause(Group.LINK, "the robot's clock has jumped",
     "Its times are off by more than `health.clock_jump_s`. The clock's offset is measured again.",
     "Nothing, unless it repeats.")
+SAMPLES_MISDATED = inform(Group.LINK, "samples of the {sensor} are {side} their frame: not used",
+    "A sample is later than its frame by more than 1 ms, or older by more than 1 s, so its time is not known. What is "
+    "not used is missing: see the alarms about samples that are stale.",
+    "Check how the firmware stamps its samples. After a stall of the robot's computer nothing, unless it repeats.")
 FRAMES_LOST = hold(Group.DATA, "frames were lost while the robot may have moved",
     "A gap in the frames while the robot moved. The robot takes a fix.", "If it repeats, check the network.")
 LINES_GARBLED = hold(Group.DATA, "lines of the robot were no frames",

@@ -33,6 +33,7 @@ from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.emergency_latch import EmergencyRules
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
 from ccatp.safety.monitor import HealthMonitor
+from ccatp.sensing.sample_times import possible_samples
 
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1
@@ -87,12 +88,13 @@ class DangerMonitor(EmergencyRules):
     def step(self, sensors: Sensors, estimate: EstimateMessage | None) -> Verdict:
         """The verdict on a frame, with main's newest estimate. A frame that is not new gets the last verdict."""
         seq = sensors.seq
-        wheels: Sequence[WheelSample] = sensors.enc
-        samples = sensors.edge
         if seq <= self._frame_seq:
             return self.verdict
         edges, origin, time, board = self._edges, self._origin, self._time, self._board
         t_s = time.at(seq, sensors.t)
+        sensors = self._with_possible_times(sensors, t_s)
+        wheels: Sequence[WheelSample] = sensors.enc
+        samples: Sequence[EdgeSample] = sensors.edge
         if time.offset_s or time.jump is not None:
             wheels, samples = time.of_samples(wheels, t_s), time.of_samples(samples, t_s)
             if estimate is not None:
@@ -128,6 +130,16 @@ class DangerMonitor(EmergencyRules):
             self.verdict = verdict = self.latch.with_emergencies(verdict)
         return verdict
 
+    def _with_possible_times(self, frame: Sensors, t_s: float) -> Sensors:
+        """The frame without samples of impossible times. What is left out is missing, and it is reported."""
+        imu, enc = possible_samples(frame.t, frame.imu), possible_samples(frame.t, frame.enc)
+        edge = possible_samples(frame.t, frame.edge)
+        if imu is frame.imu and enc is frame.enc and edge is frame.edge:
+            return frame
+        if self._board is not None:
+            self._board.misdated(t_s, frame)
+        return msgspec.structs.replace(frame, imu=imu, enc=enc, edge=edge)
+
     # -- monitors -------------------------------------------------------------------------------------------------
 
     def _look(
@@ -136,7 +148,7 @@ class DangerMonitor(EmergencyRules):
         sensors: Sensors,
         t_s: float,
         wheels: Sequence[WheelSample],
-        samples: list[EdgeSample],
+        samples: Sequence[EdgeSample],
     ) -> Sequence[MonitorFinding]:
         known, jump, last = self._known, self._time.jump, self.verdict
         if jump is not None and jump.seq == sensors.seq:

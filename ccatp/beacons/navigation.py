@@ -20,6 +20,7 @@ from ccatp.core import FloatArray, WheelSample
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
 from ccatp.links.beacon_messages import BeaconFrame, Ellipse, MoteBurst, RadioScan, worst_sigma_m
 from ccatp.links.robot_messages import Sensors
+from ccatp.sensing.sample_times import possible_samples
 
 
 class SelfMap:
@@ -140,7 +141,7 @@ class MeasurementReader:
         if self._read_to_s is None:
             self._read_to_s = sensors.t
         steering = {sample.t_s: sample.steer_rad for sample in extras.steer}
-        wheels = [self._interval(sample, steering) for sample in sensors.enc]
+        wheels = [self._interval(sample, steering) for sample in possible_samples(sensors.t, sensors.enc)]
         return BeaconMeasurements(sensors.t, tuple(one for one in wheels if one is not None), extras)
 
     def _interval(self, sample: WheelSample, steering: dict[float, float]) -> Odometry | None:

@@ -25,6 +25,7 @@ from ccatp.links.beacon_messages import BeaconFrame
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.safety.emergency_latch import EmergencyRules
+from ccatp.sensing.sample_times import possible_samples
 
 
 class _Obstacle(NamedTuple):
@@ -158,7 +159,7 @@ class BeaconSafetyRules(EmergencyRules):
 
     def _roll(self, sensors: Sensors, extras: BeaconFrame) -> None:
         steering, vehicle = {sample.t_s: sample.steer_rad for sample in extras.steer}, self._vehicle
-        for t_s, right, left in sensors.enc:
+        for t_s, right, left in possible_samples(sensors.t, sensors.enc):
             before_s = sensors.t if self._rolled_to_s is None else self._rolled_to_s
             if right is None or left is None or t_s <= before_s:
                 continue

@@ -76,7 +76,7 @@ class EdgeRule:
         """Whether no episode is open and the robot is not lifted."""
         return self._odometry is None
 
-    def step(self, samples: list[EdgeSample], estimate: EstimateMessage | None) -> None:
+    def step(self, samples: Sequence[EdgeSample], estimate: EstimateMessage | None) -> None:
         """Evaluate a frame's samples.
 
         The frame's encoder samples must be in ``track`` already. ``estimate`` is fresh and finite, or None.
@@ -186,7 +186,7 @@ class EdgeRule:
             self.episodes = [None] * SENSORS
 
 
-def _are_all_on(samples: list[EdgeSample]) -> bool:
+def _are_all_on(samples: Sequence[EdgeSample]) -> bool:
     for _, front_left, front_right, rear_left, rear_right in samples:
         if not (front_left == 1 and front_right == 1 and rear_left == 1 and rear_right == 1):
             return False

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from math import hypot, inf
 
 from ccatp import conditions
-from ccatp.conditions import MonitorFinding
+from ccatp.conditions import SAMPLE_RATES, MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.control.wheel_motion import ImuGate, MotionSum, WheelMeans
 from ccatp.core import EdgeSample, ImuSample, WheelSample
@@ -24,6 +24,7 @@ from ccatp.safety.sensor_monitors import (
     SeamMonitor,
 )
 from ccatp.safety.wheel_monitors import LATE_S, GripMonitor, WheelMonitor
+from ccatp.sensing.sample_times import LATEST_S, OLDEST_S, worst_offset_s
 
 _STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s
 _LOOK_FRAMES = 2  # while nothing is wrong, the monitors judge every second frame; the sums take all frames
@@ -31,6 +32,10 @@ _SLOW_LOOK_FRAMES = 10  # period of the monitors of slow quantities
 # The gyroscope's bias, averaged at rest. Readings are bounded, so that garbage cannot move it far.
 _BIAS_TIME_S = 0.5
 _LARGEST_BIAS_RAD_S = 0.35
+
+
+def _kinds(frame: Sensors) -> tuple[tuple[str, Sequence[ImuSample | WheelSample | EdgeSample]], ...]:
+    return ("imu", frame.imu), ("enc", frame.enc), ("edge", frame.edge)
 
 
 class HealthMonitor:
@@ -60,11 +65,11 @@ class HealthMonitor:
         self._fans = FanMonitor(cfg, robot.fan_duty, self._mirror.overhang)
         self._flicker = FlickerMonitor(cfg, self._is_explained)
         self._clock, self._gap = FindingLatch(cfg.imu_quarantine_s), FindingLatch(cfg.imu_quarantine_s)
-        self._garbled = FindingLatch(cfg.retry_after_s)
+        self._garbled, self._misdated = FindingLatch(cfg.retry_after_s), FindingLatch(cfg.retry_after_s)
         self._reported: dict[str, FindingLatch] = {}
         self._latches = (
             *(self._grip.alarm, self._wheels.alarm, self._wheels.yaw, self._fans.alarm, self._latency.alarm),
-            *(self._clock, self._gap, self._garbled, self._flicker.chatter, self._flicker.flash),
+            *(self._clock, self._gap, self._garbled, self._misdated, self._flicker.chatter, self._flicker.flash),
         )
         self._battery.reset()
         self._seams.reset()
@@ -85,6 +90,17 @@ class HealthMonitor:
         finding = conditions.CLOCK_JUMPED.found("clock", by_s, self._cfg.clock_jump_s)
         self._clock.see(t_s, finding)
         self._gate.reset()
+        self.findings = [finding]
+
+    def misdated(self, t_s: float, frame: Sensors) -> None:
+        """Report a frame, at ``t_s``, with samples of impossible times; the one furthest from the frame is named."""
+        offsets_s = {kind: worst_offset_s(frame.t, samples) for kind, samples in _kinds(frame)}
+        kind = max(offsets_s, key=lambda kind: abs(offsets_s[kind]))
+        offset_s = offsets_s[kind]
+        limit_s, side = (LATEST_S, "later than") if offset_s > 0.0 else (OLDEST_S, "older than")
+        sensor = SAMPLE_RATES[kind].sensor
+        finding = conditions.SAMPLES_MISDATED.found(kind, abs(offset_s), limit_s, sensor=sensor, side=side)
+        self._misdated.see(t_s, finding)
         self.findings = [finding]
 
     def garbled(self, at_s: float) -> MonitorFinding | None:
