@@ -26,7 +26,7 @@ from ccatp.links.robot_codec import BadLine, RobotFrame, decode_from_robot, enco
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.onboard.rules import FanRules
-from ccatp.sim.fault_plan import SIGNALS, FaultPlan, Injected
+from ccatp.sim.fault_plan import SENSOR_CLOCKS, SIGNALS, FaultPlan, Injected
 from ccatp.sim.plant import LEVEL_SLOPE, BodyStep, Disturbance, Plant, downhill
 from ccatp.sim.world import World
 
@@ -320,6 +320,11 @@ class Injector:
             rows[one.signal.rows] = one.apply(rows[one.signal.rows], t_s)
         for name in ("imu", "enc", "edge", "gravity"):
             rows[name] = [(self._stamp(t_s, row[0] - self._boot_s, is_frame=False), *row[1:]) for row in rows[name]]
+        for signal, name in SENSOR_CLOCKS.items():
+            for record in self._on[signal]:
+                if record.fault.is_active(t_s):
+                    record.add(t_s, is_changed=bool(rows[name]))
+                    rows[name] = [(max(row[0] + record.fault.by_s, 0.0), *row[1:]) for row in rows[name]]
         _, left, right = rows["fans"][-1]
         stamp, names = self._stamp(t_s, t_s - self._boot_s, is_frame=True), self._raised(t_s)
         lists, charge = (rows["imu"], rows["enc"], rows["edge"]), rows["soc"][-1][1]

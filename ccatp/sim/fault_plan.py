@@ -48,6 +48,8 @@ SIGNALS = {
     "soc": Signal("soc", (1,), 0.0, 1.0),
 }
 SENSOR_SIGNALS = tuple(SIGNALS)
+SENSOR_CLOCKS = {"imu_clock": "imu", "encoder_clock": "enc", "edge_clock": "edge", "gravity_clock": "gravity"}
+"""List of rows in a frame, by the signal of its time stamps."""
 
 
 class InjectedFault(Model):
@@ -156,8 +158,9 @@ TYPES: dict[str, dict[str, type[InjectedFault]]] = {
     # on level ground.
     "body": _types(InjectedFault, {"kidnap": {"dx_m": float, "dy_m": float, "dheading_rad": float}})
     | _types(LastingFault, {"slip": _SLIP, "drift": {"speed_m_s": Positive}}),
-    # All time stamps have an error of ``by_s``, which may be negative, or are modulo ``modulo_s``, as of a counter that
-    # overflows.
+    # The time stamps of one sensor have an error of ``by_s``, which may be negative.
+    **dict.fromkeys(SENSOR_CLOCKS, _types(LastingFault, {"jump": {"by_s": float}})),
+    # All time stamps have such an error, or are modulo ``modulo_s``, as of a counter that overflows.
     "clock": _types(LastingFault, {"jump": {"by_s": float}, "wrap": {"modulo_s": Positive}}),
     # Every n-th frame is lost, sent twice, or sent after the one that follows it.
     "frames": _types(

@@ -301,6 +301,7 @@ ELSEWHERE = {
         *(rows.RIM_AHEAD, rows.BEYOND_SEAM, rows.NO_SEAM, rows.OFF_WITHOUT_WHEELS, rows.CENTRE_NEAR_RIM),
         *(rows.ALL_OFF, rows.EARTHQUAKE, rows.EMERGENCY),
     ),
+    "tests/unit/safety/test_sample_times.py": (rows.SAMPLES_MISDATED,),
     "tests/unit/safety/test_grip.py": (rows.GRIP_LOST, rows.GRIP_LITTLE, rows.GRIP_TOO_LITTLE),
     "tests/unit/beacons/test_mission.py": tuple(row for row in DANGER if row.group is Group.BEACONS),
 }

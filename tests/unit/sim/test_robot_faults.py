@@ -49,7 +49,10 @@ def test_the_page_names_every_signal_and_type() -> None:
         ("[[faults]]\nat_s = 1.0", "plan:1: faults is unknown; did you mean fault? available: fault, link"),
         ("fault = 3", "plan: fault must be a list of tables; begin each with [[fault]]"),
         ("[link]\nat_s = 1.0", "plan: link must be a list of tables; begin each with [[link]]"),
-        ('[[fault]]\ntype = "off"', "plan:1: fault[0].signal is missing; available: body, clock, edge_front_left"),
+        (
+            '[[fault]]\ntype = "off"',
+            "plan:1: fault[0].signal is missing; available: body, clock, edge_clock, edge_front_left",
+        ),
         ('[[fault]]\nsignal = 3\ntype = "off"', "plan:2: fault[0].signal = 3 must be text in quotes"),
         (
             '[[fault]]\nsignal = "imu_wx"\ntype = "off"',
@@ -282,6 +285,17 @@ def test_a_jump_of_the_clock_shifts_every_time(config: Config, mirror: Mirror, b
         assert frame["t"] == pytest.approx(frame["seq"] / 100.0 + offset)
         for name in ("imu", "enc", "edge"):
             assert frame[name][-1][0] == pytest.approx(frame["t"])
+    assert acted(robot) == (0.5, 0.79, 30, 30)
+
+
+@pytest.mark.parametrize(("signal", "name"), [("imu_clock", "imu"), ("encoder_clock", "enc"), ("edge_clock", "edge")])
+def test_the_times_of_one_sensor_alone_can_be_wrong(config: Config, mirror: Mirror, signal: str, name: str) -> None:
+    robot = boot(config, mirror, signal=signal, type="jump", by_s=0.4, for_s=0.3)
+    for frame in drive(robot, 1.0, 1.0, 1.0):
+        assert frame["t"] == pytest.approx(frame["seq"] / 100.0)
+        for kind in ("imu", "enc", "edge"):
+            offset = 0.4 if kind == name and 50 <= frame["seq"] < 80 else 0.0
+            assert frame[kind][-1][0] == pytest.approx(frame["t"] + offset)
     assert acted(robot) == (0.5, 0.79, 30, 30)
 
 
