@@ -191,6 +191,10 @@ ENCODER_BROKEN = hold(Group.WHEELS, "the {side} encoder {what}",
     "repeated, it is a fault.", "Check its cable.")
 WHEEL_RUNS_AWAY = hold(Group.WHEELS, "the {side} wheel runs away",
     "It turns faster than commanded.", "Remove the robot: the servo fails.")
+WHEEL_SPEED_WRONG = hold(Group.WHEELS, "the {side} wheel turns {ratio} times as fast as commanded",
+    "By regression over `health.ratio_time_s`, the speed by its encoder is not within 1 +- `health.ratio_share` of the "
+    "commanded one. The robot takes a fix; repeated, it is a fault.",
+    "Check gain and supply of the servo, the encoder's counts per turn, and the wheel radius in the firmware.")
 WHEELS_STAND = hold(Group.WHEELS, "both wheels stand, or no encoder counts",
     "They were commanded to turn. The motor supply or both encoders fail.",
     "Check the robot's supply and its own log.", retries=1)

@@ -309,6 +309,9 @@ class HealthConfig(Model):
     creep_m: Positive
     runaway_m_s: Positive
     runaway_time_s: Positive
+    ratio_share: Annotated[float, Field(gt=0.0, lt=1.0)]
+    ratio_time_s: Positive
+    ratio_travel_m: Positive
     yaw_limit_rad: Positive
     yaw_share: Annotated[float, Field(ge=0.0, le=1.0)]
     yaw_time_s: Positive

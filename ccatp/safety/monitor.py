@@ -23,6 +23,7 @@ from ccatp.safety.sensor_monitors import (
     RateMonitor,
     SeamMonitor,
 )
+from ccatp.safety.speed_ratio import SpeedRatioMonitor
 from ccatp.safety.wheel_monitors import LATE_S, GripMonitor, WheelMonitor
 from ccatp.sensing.sample_times import LATEST_S, OLDEST_S, worst_offset_s
 
@@ -61,14 +62,15 @@ class HealthMonitor:
         cfg, robot = self._cfg, self._robot
         self._gate = ImuGate(cfg)
         self._wheels, self._rates, self._latency = WheelMonitor(cfg, robot), RateMonitor(cfg), LatencyMonitor(cfg)
-        self._grip = GripMonitor(cfg, robot)
+        self._grip, self._ratio = GripMonitor(cfg, robot), SpeedRatioMonitor(cfg, robot)
         self._fans = FanMonitor(cfg, robot.fan_duty, self._mirror.overhang)
         self._flicker = FlickerMonitor(cfg, self._is_explained)
         self._clock, self._gap = FindingLatch(cfg.imu_quarantine_s), FindingLatch(cfg.imu_quarantine_s)
         self._garbled, self._misdated = FindingLatch(cfg.retry_after_s), FindingLatch(cfg.retry_after_s)
         self._reported: dict[str, FindingLatch] = {}
         self._latches = (
-            *(self._grip.alarm, self._wheels.alarm, self._wheels.yaw, self._fans.alarm, self._latency.alarm),
+            *(self._grip.alarm, self._wheels.alarm, self._wheels.yaw, self._ratio.alarm, self._fans.alarm),
+            self._latency.alarm,
             *(self._clock, self._gap, self._garbled, self._misdated, self._flicker.chatter, self._flicker.flash),
         )
         self._battery.reset()
@@ -132,6 +134,10 @@ class HealthMonitor:
             self._gap.see(t_s, conditions.FRAMES_LOST.found("frames", dt_s, self._cfg.gap_s))
         imu = frame.imu
         self._means.take(wheels, dt_s)
+        if is_permitted and not frame.cmd.held and frame.cmd.age <= LATE_S:
+            self._ratio.add(dt_s, self._means.right_rad_s, self._means.left_rad_s)
+        else:
+            self._ratio.reset()
         self._sums = self._added(imu, dt_s)
         self._counts[0] += len(imu)
         self._counts[1] += len(wheels)
@@ -203,6 +209,7 @@ class HealthMonitor:
         self._commands_seq = estimate.seq
         if estimate.commanded is not None:
             self._wheels.take_commands(t_s, estimate.commanded)
+            self._ratio.take(t_s, estimate.commanded)
 
     def learn(self, t_s: float, estimate: EstimateMessage, opened: Sequence[int], is_off: Sequence[object]) -> None:
         """Take a fresh estimate; a repeated one has no effect. ``opened``: how often each edge sensor went off."""

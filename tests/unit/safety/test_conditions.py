@@ -164,6 +164,10 @@ ROWS = [
     Row(rows.SENSOR_MUCH_TOO_SLOW, lambda frame: {"enc": frame.seq % 5 == 0}, drives, SLOW_ENCODERS, "enc"),
     Row(rows.ENCODER_BROKEN, always(rates=(SPEED_RAD_S, 0.0), noise=0.0), cause="the right encoder is frozen"),
     Row(rows.WHEEL_RUNS_AWAY, always(rates=(SPEED_RAD_S, 8.0)), drives, cause="the left wheel runs away", lasts=False),
+    Row(
+        rows.WHEEL_SPEED_WRONG, always(rates=(1.3 * SPEED_RAD_S, 1.3 * SPEED_RAD_S)), drives, signal="right_wheel",
+        cause="turns 1.30 times as fast as commanded", lasts=False,
+    ),
     Row(rows.WHEELS_STAND, always(rates=(0.0, 0.0)), drives, signal="encoders", lasts=False),
     Row(rows.ENCODER_COUNTS_NOTHING, always(rates=(0.0, SPEED_RAD_S)), drives, signal="encoder_right", lasts=False),
     Row(
