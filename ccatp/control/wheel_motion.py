@@ -2,12 +2,15 @@
 
 from collections import deque
 from collections.abc import Sequence
-from math import cos, exp, inf, sin
+from math import cos, exp, inf, sin, sqrt
+from typing import NamedTuple
 
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import ImuSample, Predicted, WheelSample
 
 Pose = tuple[float, float, float]
+_HELD = (0.0, 0.0)
+_UNIFORM = 1.0 / sqrt(12.0)  # standard deviation of a uniform distribution over its width
 
 # A delay below a thousandth of a frame is a rounding error of the robot's clock.
 ROUNDING = 1e-3
@@ -15,8 +18,21 @@ ROUNDING = 1e-3
 REACH_S = 0.25
 
 
+class SetPoints(NamedTuple):
+    """Mean set points of the wheels in a frame, rad/s.
+
+    ``right_doubt_rad``, ``left_doubt_rad``: standard deviations of their integrals by the unknown moment at which the
+    robot held its wheels; the two errors have the same cause.
+    """
+
+    right_rad_s: float
+    left_rad_s: float
+    right_doubt_rad: float = 0.0
+    left_doubt_rad: float = 0.0
+
+
 class SentDrives:
-    """Predicts the state of a frame over the drives that were sent but have not acted yet.
+    """Predicts the state of a frame over the drives that were sent but have not acted yet; tells which ones acted.
 
     The echo shows the drive in force and its age; the drives sent after it follow one per frame. Each wheel is a
     first-order servo, so with a set point u for a time t
@@ -28,18 +44,28 @@ class SentDrives:
 
     def __init__(self, robot: RobotConfig, frame_s: float) -> None:
         self._radius_m, self._base_m, self._lag_s = robot.wheel_radius_m, robot.wheel_base_m, robot.wheel_lag_s
+        self._max_rad_s = robot.max_wheel_rad_s
         self.newest = 0
         self.rates = (0.0, 0.0)
         self._right_low = self._right_high = self._left_low = self._left_high = 0.0
         self.begin_session(frame_s)
 
-    def begin_session(self, frame_s: float) -> None:
-        """Begin a session with frames every ``frame_s``, and drop the drives of the last one."""
+    def begin_session(self, frame_s: float, ttl_s: float = REACH_S) -> None:
+        """Begin a session with frames every ``frame_s``, and drop the drives of the last one.
+
+        ``ttl_s``: time-to-live of drives and permits.
+        """
         if frame_s <= 0.0:
             raise ValueError(f"frame_s = {frame_s}: the period of the frames must be positive")
         self._frame_s = frame_s
         self._frame = frame_s, *_servo(self._lag_s, frame_s)
-        self._sent: deque[tuple[int, float, float]] = deque(maxlen=max(1, round(REACH_S / frame_s)))
+        self._sent: deque[tuple[int, float, float, tuple[float, float]]] = deque(
+            maxlen=max(1, round(REACH_S / frame_s))
+        )
+        self._ttl_s = ttl_s
+        # Set points at the end of the last frame, None: unknown. Without a session the robot holds its wheels.
+        self._acting: tuple[float, float] | None = _HELD
+        self._was_held = True
 
     def add(self, seq: int, right_rad_s: float, left_rad_s: float) -> None:
         """Record drive ``seq``; a number that is not newer drops the earlier drives."""
@@ -47,7 +73,10 @@ class SentDrives:
         if sent and seq <= sent[-1][0]:
             sent.clear()
         v_m_s = 0.5 * self._radius_m * (right_rad_s + left_rad_s)
-        sent.append((seq, v_m_s, self._radius_m * (right_rad_s - left_rad_s) / self._base_m))
+        fastest = max(abs(right_rad_s), abs(left_rad_s))
+        scale = self._max_rad_s / fastest if fastest > self._max_rad_s else 1.0  # as the robot does it
+        wheels = scale * right_rad_s, scale * left_rad_s
+        sent.append((seq, v_m_s, self._radius_m * (right_rad_s - left_rad_s) / self._base_m, wheels))
         self.newest, self.rates = seq, (right_rad_s, left_rad_s)
         if right_rad_s < self._right_low:
             self._right_low = right_rad_s
@@ -67,6 +96,35 @@ class SentDrives:
         self._right_low = self._right_high = self.rates[0]
         self._left_low = self._left_high = self.rates[1]
         return span
+
+    def acted(
+        self, dt_s: float, echo_seq: int, echo_age_s: float, permit_age_s: float, is_held: bool
+    ) -> SetPoints | None:
+        """Set points in the last ``dt_s``, from the echo at their end; ``None``: the drive in force is not known.
+
+        Call it once in each frame, before ``ahead``. ``permit_age_s``: age of the newest permit.
+        """
+        before, was_held = self._acting, self._was_held
+        now = _HELD if is_held or echo_seq == 0 else next((sent[3] for sent in self._sent if sent[0] == echo_seq), None)
+        self._acting, self._was_held = now, is_held
+        if now is None or before is None or now == before or dt_s <= 0.0:
+            return None if now is None else SetPoints(*now)
+        off_right, off_left = now[0] - before[0], now[1] - before[1]
+        right_doubt = left_doubt = 0.0
+        if not is_held:
+            since_s = min(echo_age_s, permit_age_s) if was_held else echo_age_s
+        elif was_held:
+            since_s = dt_s
+        elif (late_s := max(echo_age_s, permit_age_s) - self._ttl_s) > 0.0:
+            since_s = late_s
+        elif permit_age_s <= dt_s + ROUNDING * dt_s:
+            since_s = permit_age_s  # the newest permit denies this direction
+        else:  # by a rule of its own, at any time in the frame
+            since_s, doubt_s = 0.5 * dt_s, dt_s * _UNIFORM
+            right_doubt, left_doubt = doubt_s * off_right, doubt_s * off_left
+        share = min(max(since_s / dt_s, 0.0), 1.0)
+        right, left = before[0] + share * off_right, before[1] + share * off_left
+        return SetPoints(right, left, right_doubt, left_doubt)
 
     def ahead(
         self,
@@ -88,7 +146,7 @@ class SentDrives:
             sent.popleft()
         (x, y, heading), v, omega = pose, v_m_s, omega_rad_s
         creep_x, creep_y = creep
-        for seq, v_sent, omega_sent in sent:
+        for seq, v_sent, omega_sent, _ in sent:
             if seq > echo_seq:
                 dt_s, keep, mean = self._frame
             else:  # the drive in force

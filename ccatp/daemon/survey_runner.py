@@ -163,7 +163,11 @@ class SurveyFrames(ABC):
             self._is_odometry_off = is_odometry_off
             self._publish_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")
         imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
-        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
+        echo, set_points = sensors.cmd, None
+        if frame.dt_s > 0.0:
+            acted = self.sent.acted(frame.dt_s, echo.seq, echo.age, echo.permit_age, echo.held)
+            set_points = None if is_odometry_off else acted
+        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity, set_points)
         if localizer.hold_cause:
             # A filter that diverged is frozen until the next fix.
             mission.handle(EstimateDiverged(localizer.hold_cause, frame.t_s))
@@ -171,7 +175,6 @@ class SurveyFrames(ABC):
         if frame.dt_s <= 0.0:
             self.motion = None
             return
-        echo = sensors.cmd
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self.sent.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
@@ -342,7 +345,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         self.parts.check_robot(hello)
 
     def begin_session(self, hello: Hello) -> None:
-        self.sent.begin_session(1.0 / hello.frame_hz)
+        self.sent.begin_session(1.0 / hello.frame_hz, hello.ttl_s)
         self._checkpoint.boot = hello.boot
         # The robot's own floor applies where the mirror overhangs.
         self._fan_gate = FanGate(hello.robot.fan_floor if self.mirror.overhang else 0.0)

@@ -1,10 +1,12 @@
 """The full-state localizer: pose, speeds and sensor errors in one filter, on the curved surface."""
 
+from collections.abc import Sequence
 from math import atan2, cos, hypot, inf, sin, sqrt
 
 import numpy as np
 
 from ccatp.config.models import Config
+from ccatp.control.wheel_motion import SetPoints
 from ccatp.core import DeckPose, Fix, FloatArray, PanelPose, wrap_pi
 from ccatp.estimation.fixes import FixGated
 from ccatp.estimation.localizer_base import (
@@ -16,6 +18,7 @@ from ccatp.estimation.localizer_base import (
     Gravity,
     ImuReadings,
     LocalizerBase,
+    SensorTransition,
     WheelReadings,
     unwrapped,
 )
@@ -23,6 +26,7 @@ from ccatp.estimation.odometry import PosePredictor, Preintegrator, WheelAngle
 from ccatp.estimation.rest import NoiseFloor, ZeroVelocityDetector
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import STATES, V, W
+from ccatp.estimation.wheel_coast import CoastedMotion, WheelCoast
 from ccatp.filters.base import FilterDiverged, Innovation
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
@@ -32,6 +36,7 @@ _CONSISTENT = 3  # if this many refused fixes agree with each other, the pose is
 _ROUNDING_S = 1e-6
 _NOMINAL_FRAME_S = 0.01
 _SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # for the error of the heading, from the end of a leg
+_TRUSTED_GAP_S = 0.03  # after a longer gap the odometry of the leg teaches nothing about slip and sensors
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
 
 
@@ -40,7 +45,8 @@ class FullStateLocalizer(LocalizerBase):
 
     Frames are collected into blocks, and the filter makes one step per block. Between steps the pose advances by dead
     reckoning. ``pose``: in the frame of the panel under the robot; ``creep``: downhill drift per metre of travel in its
-    plane; ``position_sigma_m``: in the worst direction, at the last step of the filter.
+    plane; ``position_sigma_m``: in the worst direction, at the last step of the filter, which in a gap of the encoders
+    is that of the newest frame.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, start: PanelPose, wrap: FilterWrap = unwrapped) -> None:
@@ -49,6 +55,7 @@ class FullStateLocalizer(LocalizerBase):
         self._rest_rate_rad_s = self._full.rest_rate_rad_s
         self._update_period_s = self._full.update_period_s - _ROUNDING_S
         self._right, self._left = WheelAngle(), WheelAngle()
+        self._coast = WheelCoast(robot.wheel_lag_s)
         self._gyro = NoiseFloor(cfg.localizer.gyroscope_sigma_rad_s**2)
         self._accelerometer = NoiseFloor(cfg.localizer.accelerometer_sigma_m_s2**2)
         self._rest = ZeroVelocityDetector(self._full.rest_after_s, self._gyro, self._accelerometer)
@@ -100,9 +107,24 @@ class FullStateLocalizer(LocalizerBase):
     # -- frames -------------------------------------------------------------------------------------------------------
 
     def _use(
-        self, dt_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings, edges: Edges, gravity: Gravity
+        self,
+        dt_s: float,
+        imu: ImuReadings,
+        right: WheelReadings,
+        left: WheelReadings,
+        edges: Edges,
+        gravity: Gravity,
+        set_points: SetPoints | None,
     ) -> None:
-        right_rad, left_rad = self._right.add(*right, dt_s), self._left.add(*left, dt_s)
+        coasted = None
+        if not (right[0] and left[0]) or self._coast.gap_s:
+            right, left, coasted = self._coasted(dt_s, right, left, set_points)
+        if coasted is None:
+            right_rad, left_rad = self._right.add(*right, dt_s), self._left.add(*left, dt_s)
+            self._coast.follow(dt_s, set_points, right_rad, left_rad)
+        else:
+            right_rad = self._turn(self._right, right, dt_s, coasted.right_rad)
+            left_rad = self._turn(self._left, left, dt_s, coasted.left_rad)
         if self._is_new_base:
             self._is_new_base = False
             # For the filter, the motion in the frame that begins a new time base belongs to the gap before it.
@@ -118,14 +140,7 @@ class FullStateLocalizer(LocalizerBase):
             if is_still:
                 self._right.rest(right[1])
                 self._left.rest(left[1])
-                self._rebase()  # at rest the sums contain only noise
-                self._rested_s += dt_s
-                self._block.stand(imu)
-                rest.add(imu, gravity)
-                if rest.count >= _CHUNK:
-                    self._use_rest(self.t_s)
-                self._edges.scan(edges)
-                self._locate()
+                self._stand(dt_s, imu, edges, gravity, set_points)
                 return
             self._use_rest(self.t_s - dt_s)
             self._estimate.begin_leg()
@@ -134,32 +149,99 @@ class FullStateLocalizer(LocalizerBase):
         elif rest.still_s and not is_still:
             rest.moved()
         self._frame_s = frame_s
-        block = self._block
-        block.add(dt_s, imu, is_turning=bool(right_rad or left_rad))
+        self._block.add(dt_s, imu, is_turning=bool(right_rad or left_rad))
         self._running.advance(dt_s, right_rad, left_rad, imu[-1][2] if imu else None)
         transitions = self._edges.scan(edges)
         # Wheels without samples do not count as standing.
         is_stop = is_still and self._right.is_fresh and self._left.is_fresh and rest.stood(dt_s)
-        if transitions or is_stop or block.dt_s >= self._update_period_s:
-            self._take_block(self.t_s)
-            for transition in transitions:
-                self._estimate.cross(transition, self.t_s)
-            if is_stop:
-                self._estimate.stop((self._right.angle_rad, self._left.angle_rad))
-                self._rebase()
-            self._predict_pose(self._half_s)
+        # In a gap every frame is a step of the filter, so that the covariance is that of the frame.
+        if transitions or is_stop or self._block.dt_s >= self._update_period_s or coasted is not None:
+            self._end_block(transitions, coasted, is_stop=is_stop)
         self._locate()
+
+    def _stand(
+        self, dt_s: float, imu: ImuReadings, edges: Edges, gravity: Gravity, set_points: SetPoints | None
+    ) -> None:
+        """Take a frame at rest."""
+        self._rebase()  # at rest the sums contain only noise
+        if set_points is not None and set_points[0] == set_points[1] == 0.0:
+            self._coast.stand()
+        self._rested_s += dt_s
+        self._block.stand(imu)
+        self._rest.add(imu, gravity)
+        if self._rest.count >= _CHUNK:
+            self._use_rest(self.t_s)
+        self._edges.scan(edges)
+        self._locate()
+
+    def _end_block(
+        self, transitions: Sequence[SensorTransition], coasted: CoastedMotion | None, *, is_stop: bool
+    ) -> None:
+        if coasted is None:
+            self._coast.learn(*self._running.wheel_rates())
+        self._take_block(self.t_s, coasted)
+        for transition in transitions:
+            self._estimate.cross(transition, self.t_s)
+        if is_stop:
+            self._estimate.stop((self._right.angle_rad, self._left.angle_rad))
+            self._rebase()
+        self._predict_pose(self._half_s)
+
+    # -- frames without encoder samples -------------------------------------------------------------------------------
+
+    def _coasted(
+        self, dt_s: float, right: WheelReadings, left: WheelReadings, set_points: SetPoints | None
+    ) -> tuple[WheelReadings, WheelReadings, CoastedMotion | None]:
+        """The samples to use of a frame in a gap, at its end, or of slow encoders; the predicted motion in a gap."""
+        coast, since_s, is_resting = self._coast, self.t_s - dt_s, self._rest.is_resting
+        wheels = self._right, self._left
+        is_right, is_left = (
+            not r[0] and wheel.is_silent(self.t_s) for wheel, r in zip(wheels, (right, left), strict=True)
+        )
+        coasted = None
+        if (is_right or is_left) and dt_s > 0.0 and not self.is_frozen:
+            if not coast.gap_s:
+                if self._block.dt_s > 0.0:
+                    self._take_block(since_s)
+                    self._predict_pose(self._half_s)
+                variance_rad2 = max(wheel.variance_rad2() for wheel in wheels)
+                coast.begin(*self._running.wheel_rates(), variance_rad2, is_resting=is_resting)
+            coasted = coast.advance(dt_s, set_points, is_right=is_right, is_left=is_left)
+            self.gap_s += dt_s
+            if coast.gap_s > _TRUSTED_GAP_S and coast.has_moved:
+                self._estimate.distrust_leg()
+        rates = coast.rates()
+        if self._right.is_coasting and right[0]:
+            right = self._right.end_coasting(since_s, rates[0], *right)
+        if self._left.is_coasting and left[0]:
+            left = self._left.end_coasting(since_s, rates[1], *left)
+        if coasted is None and coast.gap_s:
+            coast.end()
+        if self._right.has_lost or self._left.has_lost:
+            self._right.has_lost = self._left.has_lost = False
+            self._rebase()
+            if not is_resting:
+                self._estimate.resume(sqrt(max(wheel.variance_rad2() for wheel in wheels)))
+        return right, left, coasted
+
+    @staticmethod
+    def _turn(wheel: WheelAngle, readings: WheelReadings, dt_s: float, coasted_rad: float) -> float:
+        """The turn of a wheel in a frame of a gap, in which the other one may have samples."""
+        if readings[0]:
+            return wheel.add(*readings, dt_s)
+        wheel.coast(coasted_rad)
+        return coasted_rad
 
     def _rebase(self) -> None:
         self._right.rebase()
         self._left.rebase()
 
-    def _take_block(self, t_s: float) -> None:
+    def _take_block(self, t_s: float, coasted: CoastedMotion | None = None) -> None:
         block = self._block.take()
         self._half_s = 0.5 * block.dt_s
         self._estimate.journal.begin(t_s, block.dt_s)
         variances = self._gyro.variance, self._accelerometer.variance
-        self._estimate.move(t_s, block, self._right, self._left, variances)
+        self._estimate.move(t_s, block, self._right, self._left, variances, coasted)
         mean = self._filter.mean
         self._check_speeds(float(mean[V]), float(mean[W]))
 
@@ -235,6 +317,7 @@ class FullStateLocalizer(LocalizerBase):
             self._relocate(z, self._estimate.expect(fix.t_s, z)[0], variance, is_lost=True)
             self.is_frozen = False
         self.counts["fixes"] += 1
+        self.gap_s = self._coast.gap_s
         self._predict_pose(0.0)
         self._locate()
         now = self._running

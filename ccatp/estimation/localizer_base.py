@@ -11,7 +11,7 @@ import numpy as np
 
 from ccatp.conditions import FILTER_DIVERGED, FRAMES_BACKWARD, SENSOR_BACKWARD
 from ccatp.config.models import Config
-from ccatp.control.wheel_motion import ImuGate, WheelMeans, largest_rate_rad_s
+from ccatp.control.wheel_motion import ImuGate, SetPoints, WheelMeans, largest_rate_rad_s
 from ccatp.core import (
     EdgeSample,
     Fix,
@@ -37,7 +37,7 @@ LONGEST_GAP_S = 0.4
 """After this time without a drive the robot stands: time-to-live of the last drive, and run-down of the wheels."""
 BACKWARD_LIMIT = 5
 """Number of backward time stamps in a row that requests a hold."""
-_ROUNDING_S = 1e-6
+_ROUNDING_S = 1e-3  # interface control document 1: a sample may be later than its frame by the rounding of both times
 _READABLE = 1e9  # rad/s or m/s^2: far beyond every sensor's range; its squares and products stay finite
 
 
@@ -211,11 +211,13 @@ class LocalizerBase(ABC):
     before the first. ``hold_cause``: why the mission should hold, until ``clear_hold``. ``is_frozen``: the filter has
     diverged, and the pose is constant until the next fix. ``notices``: for the operator, cleared by their reader.
     Refused are samples older than ``localizer.history_s``, inertial samples that contradict the wheels, and impossible
-    wheel rates.
+    wheel rates. ``gap_s``: time without encoder samples since the last fix that was used, s; then the odometry is
+    predicted from the drives (``wheel_coast``).
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, states: int, wrap: FilterWrap) -> None:
         self.t_s, self.hold_cause, self.is_frozen = -inf, "", False
+        self.gap_s = 0.0
         self.counts: dict[str, int] = Counter()
         self.notices: list[str] = []
         # Subclasses re-initialise the filter at once; only its size matters here.
@@ -239,11 +241,18 @@ class LocalizerBase(ABC):
         self.hold_cause = ""
 
     def step(
-        self, t_s: float, imu: ImuReadings, encoders: Sequence[WheelSample], edges: Edges, gravity: Gravity = None
+        self,
+        t_s: float,
+        imu: ImuReadings,
+        encoders: Sequence[WheelSample],
+        edges: Edges,
+        gravity: Gravity = None,
+        set_points: SetPoints | None = None,
     ) -> None:
         """Take one sensors frame at robot time ``t_s``: any number of samples of each kind, oldest first.
 
-        Unusable samples are dropped and counted. A frame that is not newer than the last one has no effect.
+        ``set_points``: those of the wheels since the last frame, ``None``: unknown. Unusable samples are dropped and
+        counted. A frame that is not newer than the last one has no effect.
         """
         last_s = self.t_s
         dt_s = t_s - last_s
@@ -270,7 +279,7 @@ class LocalizerBase(ABC):
             self._request_hold(SENSOR_BACKWARD.text(sensor=intake.backward_source))
             intake.backward_source = ""
         try:
-            self._use(dt_s, imu, right, left, edges, gravity)
+            self._use(dt_s, imu, right, left, edges, gravity, set_points)
         except FilterDiverged as error:
             self._freeze(error)
 
@@ -314,6 +323,13 @@ class LocalizerBase(ABC):
 
     @abstractmethod
     def _use(
-        self, dt_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings, edges: Edges, gravity: Gravity
+        self,
+        dt_s: float,
+        imu: ImuReadings,
+        right: WheelReadings,
+        left: WheelReadings,
+        edges: Edges,
+        gravity: Gravity,
+        set_points: SetPoints | None,
     ) -> None:
         """Advance the filter, unless frozen, by ``dt_s`` (0 in a new time base); may raise ``FilterDiverged``."""

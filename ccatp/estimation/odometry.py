@@ -208,6 +208,11 @@ class PosePredictor:
         turning = 2.0 * radius_dt2 * angle_variance_rad2 / self._base_m**2
         self._gyro_share = turning / (turning + rate_variance_rad2_s2)
 
+    def wheel_rates(self) -> tuple[float, float]:
+        """Rates of the right and of the left wheel, rad/s."""
+        side = 0.5 * self.omega_rad_s / self._per_base
+        return (self.v_m_s + side) / self._right_m, (self.v_m_s - side) / self._left_m
+
     def stand(self) -> None:
         """Set all speeds to zero: the robot is at rest."""
         self.v_m_s = self.omega_rad_s = self._a = 0.0
@@ -309,7 +314,7 @@ _MOST_MISSED = 4
 # Number of exact zeros in a row that shows a counting encoder; an analogue one never gives exact zeros.
 _ZEROS_OF_A_COUNTER = 8
 _COUNTER_NOISE = 1.0 / 12.0  # variance of a uniform distribution over one count
-_MIN_VARIANCE_RAD2 = 1e-10  # a third of a micrometre of travel; less would only cost the filter digits
+MIN_VARIANCE_RAD2 = 1e-10  # a third of a micrometre of travel; less would only cost the filter digits
 # After this time without a sample the wheel's motion in between is uncertain.
 _GAP_S = 0.02
 # A sample at most this long before the end of its frame counts as taken at its end.
@@ -328,20 +333,23 @@ class WheelAngle:
 
     For a counting encoder the sum of rate times period is exact to one count. The noisy rate of an analogue encoder is
     integrated by the trapezoidal rule. ``noise_rad2_s2``: variance of a sample at rest, None before the first rest.
+    ``is_coasting``: it takes predicted turns; ``has_lost``: samples of the last gap were lost.
     """
 
     def __init__(self) -> None:
         self.angle_rad = self._gap_rad = self._bridged_s = self._bridged_rad = self._mean_rate = self._rate = 0.0
-        self.is_fresh = self.is_counter = False
+        self.is_fresh = self.is_counter = self.is_coasting = self.has_lost = False
         self.quantum_rad = self._period_s = inf
         self._t_s = -inf
         self._seen = self._zeros = 0
+        self._coasted_rad = 0.0
         self.noise_rad2_s2: float | None = None
 
     def restart(self) -> None:
         """Begin again with the next sample, because the robot's clock has jumped."""
         self._t_s = -inf
         self._bridged_s = self._bridged_rad = 0.0
+        self._coasted_rad = 0.0
 
     def rebase(self) -> None:
         """Set the angle to zero."""
@@ -378,6 +386,37 @@ class WheelAngle:
             self._bridged_s = self._bridged_rad = 0.0
         self.angle_rad += turned
         return turned
+
+    def is_silent(self, t_s: float) -> bool:
+        """Whether a frame at ``t_s`` without samples is a gap: the encoder is not merely slower than the frames."""
+        limit_s = _LOST * self._period_s
+        return t_s - self._t_s > (limit_s if limit_s < inf else _GAP_S)
+
+    def coast(self, turned_rad: float) -> None:
+        """Take a predicted turn in place of the samples of a frame."""
+        self.is_fresh, self.is_coasting = False, True
+        self._coasted_rad += turned_rad
+        self.angle_rad += turned_rad
+
+    def end_coasting(
+        self, since_s: float, rate_rad_s: float, times_s: Sequence[float], rates_rad_s: Sequence[float]
+    ) -> tuple[Sequence[float], Sequence[float]]:
+        """End a gap with the samples of a frame after ``since_s``; returns those that are to be added.
+
+        If all samples of the gap have come, only late, they replace the predicted turns. Otherwise the prediction stays
+        (``has_lost``), ``rate_rad_s`` at its end included, and samples count from ``since_s`` on.
+        """
+        self.is_coasting = False
+        coasted_rad, self._coasted_rad = self._coasted_rad, 0.0
+        period_s = self._period_s if self._period_s < inf else _GAP_S
+        self.has_lost = times_s[0] - self._t_s > _LOST * period_s
+        if not self.has_lost:
+            self._bridged_s, self._bridged_rad = self._bridged_s + period_s, self._bridged_rad + coasted_rad
+            return times_s, rates_rad_s
+        self._bridged_s = self._bridged_rad = 0.0
+        self._t_s, self._rate, self._mean_rate = since_s, rate_rad_s, rate_rad_s
+        first = next((k for k, t_s in enumerate(times_s) if t_s > since_s), len(times_s))
+        return times_s[first:], rates_rad_s[first:]
 
     def _bridge(self, dt_s: float) -> float:
         if self._t_s == -inf or self._bridged_s >= _BRIDGED_S:
@@ -457,4 +496,4 @@ class WheelAngle:
         """Variance of the angle's bounded error: that of one count, or almost zero for an analogue encoder."""
         if self.is_counter and self.quantum_rad < inf:
             return self.quantum_rad * self.quantum_rad * _COUNTER_NOISE
-        return _MIN_VARIANCE_RAD2
+        return MIN_VARIANCE_RAD2

@@ -12,10 +12,11 @@ from ccatp.core import DeckPose, FloatArray, PanelId, difference
 from ccatp.estimation import state_model as sm
 from ccatp.estimation.fixes import fix_row, relocated
 from ccatp.estimation.localizer_base import SensorTransition
-from ccatp.estimation.odometry import PreintegratedMotion, Slope, Terrain, WheelAngle, gravity_on
+from ccatp.estimation.odometry import MIN_VARIANCE_RAD2, PreintegratedMotion, Slope, Terrain, WheelAngle, gravity_on
 from ccatp.estimation.rest import ZeroVelocityReading, heading_from_gravity
 from ccatp.estimation.seams import SeamLines
 from ccatp.estimation.slip_prior import SlipPrior
+from ccatp.estimation.wheel_coast import CoastedMotion
 from ccatp.filters.base import Filter, Innovation
 from ccatp.mirror.mirror import Mirror
 
@@ -84,8 +85,13 @@ class SurveyFilter:
         right: WheelAngle,
         left: WheelAngle,
         imu_variances: tuple[float, float],
+        coasted: CoastedMotion | None = None,
     ) -> None:
-        """Frames up to ``t_s``: predict, then update with wheel angles, angular rate and acceleration."""
+        """Frames up to ``t_s``: predict, then update with wheel angles, angular rate and acceleration.
+
+        ``coasted``: the angles of the block are predicted ones. Their errors are a drift of the angles, so that the
+        body follows the prediction as far as it is certain.
+        """
         dt_s = block.dt_s
         slips = self._legs.wander(block.turning_s) if dt_s > 0.0 else (0.0, 0.0, 0.0)
         encoders = self.encoder_walk(right) * dt_s
@@ -93,7 +99,9 @@ class SurveyFilter:
         # The rate before the angles: after them its variance would be so small that digits are lost.
         if block.rate_rad_s is not None:
             readings.append((sm.W, block.rate_rad_s, imu_variances[0] / block.samples))
-        if right.is_fresh or left.is_fresh:
+        if coasted is not None:
+            readings += [(sm.PR, right.angle_rad, MIN_VARIANCE_RAD2), (sm.PL, left.angle_rad, MIN_VARIANCE_RAD2)]
+        elif right.is_fresh or left.is_fresh:
             gap_rad = right.take_gap() + left.take_gap()
             variance = max(right.variance_rad2(), left.variance_rad2()) + gap_rad * gap_rad
             for state, (angle_rad, lag_rad2) in ((sm.PR, right.angle_at(t_s)), (sm.PL, left.angle_at(t_s))):
@@ -106,7 +114,7 @@ class SurveyFilter:
 
         def step() -> None:
             if dt_s > 0.0:
-                self._predict(dt_s, slips, encoders)
+                self._predict(dt_s, slips, encoders, coasted)
             if rows is not None:
                 self._filter.update(rows.z, rows, rows.R)
 
@@ -120,7 +128,9 @@ class SurveyFilter:
         mean = self._filter.mean
         return self._mirror.nearest_panel(float(mean[sm.X]), float(mean[sm.Y]))
 
-    def _predict(self, dt_s: float, slips: tuple[float, float, float], encoders: float) -> None:
+    def _predict(
+        self, dt_s: float, slips: tuple[float, float, float], encoders: float, coasted: CoastedMotion | None
+    ) -> None:
         full, (slip, creep, turn_creep) = self._full, slips
         mean: FloatArray = self._filter.mean
         slope = self.slope()
@@ -138,7 +148,21 @@ class SurveyFilter:
         lost = (self._base_per_radius * full.turn_loss_per_creep) ** 2 * turned_rad
         variance = share * share * float(self._filter.covariance[sm.CT, sm.CT])
         drift[sm.PR] = drift[sm.PL] = encoders + lost * (creep * creep + variance)
-        self._filter.predict(motion, motion.noise(self._filter.mean, impulses, drift))
+        Q = motion.noise(self._filter.mean, impulses, drift)
+        if coasted is not None:
+            Q[sm.PR, sm.PR] += coasted.right_rad2
+            Q[sm.PL, sm.PL] += coasted.left_rad2
+            Q[sm.PR, sm.PL] += coasted.both_rad2
+            Q[sm.PL, sm.PR] += coasted.both_rad2
+        self._filter.predict(motion, Q)
+
+    def resume(self, sigma_rad: float) -> None:
+        """Count the wheel angles from zero, because samples were lost: nothing of before measures them any more."""
+        self.journal.do(lambda: self._renew(sm.ANGLES, sigma_rad))
+
+    def distrust_leg(self) -> None:
+        """Do not use the odometry from the begin of the leg to the next fix to learn slip, creep and sensor errors."""
+        self._is_trusted = False
 
     def encoder_walk(self, wheel: WheelAngle) -> float:
         """Growth of the variance of the angle per second by white rate noise; none for a counting encoder."""
@@ -303,9 +327,9 @@ class SurveyFilter:
     def inflate_covariance(self, way_m: float, turn_rad: float) -> None:
         """Inflate the covariance of the pose by an unobserved motion; the next fix then corrects only the pose.
 
-        The odometry from the begin of the leg to that fix is not used to learn slip, creep and sensor errors.
+        The leg is not trusted; see ``distrust_leg``.
         """
-        self._is_trusted = False
+        self.distrust_leg()
         Q = np.zeros((sm.STATES, sm.STATES))
         Q[sm.X, sm.X] = Q[sm.Y, sm.Y] = way_m * way_m
         Q[sm.PSI, sm.PSI] = turn_rad * turn_rad

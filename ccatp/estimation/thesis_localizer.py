@@ -7,6 +7,7 @@ from math import hypot, inf, sqrt
 import numpy as np
 
 from ccatp.config.models import Config, LocalizerConfig, RobotConfig
+from ccatp.control.wheel_motion import SetPoints
 from ccatp.core import (
     DeckPose,
     Fix,
@@ -228,7 +229,14 @@ class FourStateLocalizer(LocalizerBase):
         return 0.0, 0.0
 
     def _use(
-        self, dt_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings, edges: Edges, gravity: Gravity
+        self,
+        dt_s: float,
+        imu: ImuReadings,
+        right: WheelReadings,
+        left: WheelReadings,
+        edges: Edges,
+        gravity: Gravity,
+        set_points: SetPoints | None,
     ) -> None:
         if self.is_frozen:
             return

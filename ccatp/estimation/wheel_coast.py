@@ -1,0 +1,164 @@
+"""Motion of the wheels while the encoders give no samples, predicted from the drives that are in force.
+
+A wheel is a first-order servo: ``T dw/dt + w = u``, so its follow error ``d = integral of u - angle`` is ``T w``. Over
+a time t with a constant set point ``d' = u T + (d - u T) exp(-t/T)`` and ``turn = u t - (d' - d)``. While there are
+samples the follow error is measured, and T is learned from it. So the angle at which a wheel comes to rest after its
+set point is zero does not depend on T at all; T matters only while the wheel runs down or up.
+
+What is not known, as the covariance of both angles' errors since the begin of the gap:
+
+* the follow error at its begin (dead time of the control loop, readings of the angles): it appears with the share
+  1 - exp(-t/T);
+* T: its learned standard deviation, times the change of the follow error with T;
+* the moment at which a robot held its wheels by a rule of its own, see ``SetPoints``;
+* the set points, where they are not known: anything from the recent rate on to an immediate stop.
+"""
+
+from math import exp, sqrt
+from typing import NamedTuple
+
+from ccatp.control.wheel_motion import SetPoints
+
+# A drive acts in the next step of the control loop, which has 500 Hz or more.
+_DEAD_TIME_S = 0.001
+_STILL_RAD = 1e-4  # a wheel that turns less in a frame stands: 3 um
+# Standard deviation of a lag that was never measured: the worlds draw it uniformly from 20 % to both sides.
+_LAG_SPREAD = 0.2 / sqrt(3.0)
+# A lag is never known better than to this part: servo and load are not exactly of first order.
+_LEAST_LAG_SPREAD = 0.01
+_RATE_SIGMA_RAD_S = 0.05  # of the rate by which the follow error is divided: two counts in 40 ms, smoothed
+_FAST_RAD_S = 0.5  # a slower wheel shows nothing of its lag
+_SAMPLES = 25.0  # a servo's deviations from first order are the same over about a second: 25 steps of the filter
+# After this time without a drive the robot stands: time-to-live of the last drive, and run-down of the wheels.
+_STANDS_AFTER_S = 0.4
+
+
+class CoastedMotion(NamedTuple):
+    """Turns of the wheels in a frame without samples, rad, and the growth of the covariance of their errors, rad^2."""
+
+    right_rad: float
+    left_rad: float
+    right_rad2: float
+    left_rad2: float
+    both_rad2: float  # covariance of right and left
+
+
+class WheelCoast:
+    """Follows the set points of both wheels, and predicts the wheels without samples.
+
+    ``gap_s``: length of the present gap, 0 while there are samples; ``has_moved``: the wheels turned in it.
+    """
+
+    def __init__(self, wheel_lag_s: float) -> None:
+        self.gap_s = 0.0
+        self._lag_s = wheel_lag_s
+        self._spread2 = (_LAG_SPREAD * wheel_lag_s) ** 2
+        self._least2 = (_LEAST_LAG_SPREAD * wheel_lag_s) ** 2
+        self._follows = [0.0, 0.0]  # follow errors of the right and the left wheel, rad
+        self._is_known = self.has_moved = True  # the follow errors are measured
+        self.begin(0.0, 0.0, 0.0, is_resting=True)
+
+    def stand(self) -> None:
+        """The wheels stand, and their set points are zero."""
+        self._follows = [0.0, 0.0]
+        self._is_known = True
+
+    def follow(self, dt_s: float, set_points: SetPoints | None, right_rad: float, left_rad: float) -> None:
+        """Take a frame with samples: the set points of the wheels, and what they turned."""
+        if set_points is None or set_points[2] or set_points[3]:
+            self._is_known = False
+            return
+        follows = self._follows
+        follows[0] += set_points[0] * dt_s - right_rad
+        follows[1] += set_points[1] * dt_s - left_rad
+
+    def learn(self, right_rad_s: float, left_rad_s: float) -> None:
+        """Learn the lag from the present rates of the wheels."""
+        if not self._is_known:
+            return
+        for follow, rate in zip(self._follows, (right_rad_s, left_rad_s), strict=True):
+            if -_FAST_RAD_S < rate < _FAST_RAD_S:
+                continue
+            noise = _SAMPLES * ((_DEAD_TIME_S * rate) ** 2 + (self._lag_s * _RATE_SIGMA_RAD_S) ** 2)
+            gain = self._spread2 * rate / (self._spread2 * rate * rate + noise)
+            self._lag_s = max(self._lag_s + gain * (follow - self._lag_s * rate), 1e-3)
+            self._spread2 = max((1.0 - gain * rate) * self._spread2, self._least2)
+
+    def begin(self, right_rad_s: float, left_rad_s: float, reading_rad2: float, *, is_resting: bool) -> None:
+        """Begin a gap at these rates of the wheels; ``reading_rad2``: variance of an angle's reading."""
+        self._first2, self._by_lag, self._largest, self._shown2 = [0.0, 0.0], (0.0, 0.0), 0.0, [0.0, 0.0]
+        self._kept, self._free = 1.0, (right_rad_s, left_rad_s)
+        self.has_moved = False
+        if is_resting:
+            return
+        lag_s, first2, follows = self._lag_s, self._first2, self._follows
+        for k, rate in enumerate(self._free):
+            # Two estimates of the follow error: the measured one, and lag times rate.
+            own = (_DEAD_TIME_S * rate) ** 2 + 2.0 * reading_rad2
+            of_rate = self._spread2 * rate * rate + (lag_s * _RATE_SIGMA_RAD_S) ** 2
+            share = own / (own + of_rate) if self._is_known else 1.0
+            follows[k] += share * (lag_s * rate - follows[k])
+            first2[k] = (1.0 - share) * own if self._is_known else of_rate
+
+    def advance(
+        self, dt_s: float, set_points: SetPoints | None, *, is_right: bool = True, is_left: bool = True
+    ) -> CoastedMotion:
+        """Take a frame in which the right, the left, or both wheels have no samples."""
+        before_s, self.gap_s = self.gap_s, self.gap_s + dt_s
+        found = self._advance_unknown(before_s) if set_points is None else self._advance(dt_s, set_points)
+        right_rad, left_rad, right_rad2, left_rad2, both_rad2 = found
+        self.has_moved = self.has_moved or abs(right_rad) + abs(left_rad) > _STILL_RAD
+        if not (is_right and is_left):
+            right_rad2, left_rad2, both_rad2 = is_right * right_rad2, is_left * left_rad2, 0.0
+        return CoastedMotion(right_rad, left_rad, right_rad2, left_rad2, both_rad2)
+
+    def _advance(self, dt_s: float, set_points: SetPoints) -> CoastedMotion:
+        lag_s, follows, turns, changes = self._lag_s, self._follows, [0.0, 0.0], [0.0, 0.0]
+        keep = exp(-dt_s / lag_s)
+        for k in (0, 1):
+            u, follow = set_points[k], follows[k]
+            off = follow - u * lag_s
+            follows[k] = u * lag_s + off * keep
+            turns[k] = u * dt_s - (follows[k] - follow)
+            changes[k] = keep * self._by_lag[k] + u * (1.0 - keep) + off * keep * dt_s / (lag_s * lag_s)
+        self._by_lag = right, left = changes[0], changes[1]
+        # Errors with one cause for the whole gap: where they become smaller again, the variance stays.
+        size = right * right + left * left
+        grown = self._spread2 * (size - self._largest) / size if size > self._largest else 0.0
+        self._largest = max(size, self._largest)
+        self._kept *= keep
+        shown = (1.0 - self._kept) ** 2
+        first_right, first_left = shown * self._first2[0], shown * self._first2[1]
+        before_right, before_left = self._shown2
+        self._shown2 = [first_right, first_left]
+        stop_right, stop_left = set_points[2:]
+        return CoastedMotion(
+            turns[0],
+            turns[1],
+            grown * right * right + first_right - before_right + stop_right * stop_right,
+            grown * left * left + first_left - before_left + stop_left * stop_left,
+            grown * right * left + stop_right * stop_left,
+        )
+
+    def _advance_unknown(self, before_s: float) -> CoastedMotion:
+        """Set points that are not known: anything from the rate before the gap to an immediate stop is as likely."""
+        self._is_known = False
+        begin_s, end_s = min(before_s, _STANDS_AFTER_S), min(self.gap_s, _STANDS_AFTER_S)
+        right, left = self._free
+        way_s, spread_s2 = 0.5 * (end_s - begin_s), (end_s * end_s - begin_s * begin_s) / 12.0
+        self._follows = [0.0, 0.0]
+        return CoastedMotion(
+            *(way_s * right, way_s * left),
+            *(spread_s2 * right * right, spread_s2 * left * left, spread_s2 * right * left),
+        )
+
+    def rates(self) -> tuple[float, float]:
+        """Predicted rates of the wheels, rad/s."""
+        right, left = self._follows
+        return right / self._lag_s, left / self._lag_s
+
+    def end(self) -> None:
+        """Samples come again; until the next rest the follow errors are those of the prediction."""
+        self.gap_s = 0.0
+        if self.has_moved:
+            self._is_known = False
