@@ -181,7 +181,7 @@ class SurveyFrames(ABC):
         sigmas_of = self._position_sigma_m, self.parts.heading_sigma_rad
         deck_of, turn_creep_of = self.mirror.deck_pose, self.parts.turn_creep_m_rad
         self.motion = StateEstimate(
-            frame.t_s, frame.dt_s, pose, deck_of, v, omega, creep, ahead, *sigmas_of, turn_creep_of
+            frame.t_s, frame.dt_s, pose, deck_of, v, omega, creep, ahead, *sigmas_of, turn_creep_of, localizer.gap_s
         )
 
     def _position_sigma_m(self) -> float:

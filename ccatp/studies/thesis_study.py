@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
+from ccatp.control.wheel_motion import SetPoints
 from ccatp.core import EdgeSample, EventCode, Fix, FloatArray, GravitySample, ImuSample, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.localizer_base import SensorTransition
@@ -91,7 +92,7 @@ class ThesisLocalizer(FourStateLocalizer):
 
     def step(
         self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample], edges: Sequence[EdgeSample],
-        gravity: GravitySample | None = None,
+        gravity: GravitySample | None = None, set_points: SetPoints | None = None,
     ) -> None:  # fmt: skip
         """Process one sensors frame; see ``FourStateLocalizer.step``."""
         k = 1.0 / self.period_factor
@@ -101,6 +102,7 @@ class ThesisLocalizer(FourStateLocalizer):
             [WheelSample(k * t, right, left) for t, right, left in encoders],
             [EdgeSample(k * t, *values) for t, *values in edges],
             gravity,
+            set_points,
         )
 
     def fuse_fix(self, fix: Fix) -> float:

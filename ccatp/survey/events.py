@@ -60,16 +60,17 @@ _SURVEYING = _ANYWHERE | {
     MissionEvent.GO_HOME: RETURNING,
     MissionEvent.GO_ON: TURNING,
 }
+_STOPPING = {MissionEvent.ARRIVED: SETTLING, MissionEvent.FIND: SETTLING}
 # (state, event) -> state. An edge precedes an abort: while backing off, GO_HOME has no effect. DONE is final.
 TRANSITIONS = MappingProxyType(
     {
         IDLE: _SURVEYING | {MissionEvent.FIND: SETTLING},
-        TURNING: _SURVEYING | {MissionEvent.TURNED: DRIVING, MissionEvent.ARRIVED: SETTLING},
-        DRIVING: _SURVEYING | {MissionEvent.REALIGN: TURNING, MissionEvent.ARRIVED: SETTLING},
+        TURNING: _SURVEYING | _STOPPING | {MissionEvent.TURNED: DRIVING},
+        DRIVING: _SURVEYING | _STOPPING | {MissionEvent.REALIGN: TURNING},
         SETTLING: _SURVEYING | {MissionEvent.SETTLED: MEASURING},
         MEASURING: _SURVEYING,
         BACKING_OFF: _ANYWHERE | {MissionEvent.FIND: SETTLING},
-        RETURNING: _ANYWHERE | {MissionEvent.EDGE: BACKING_OFF},
+        RETURNING: _ANYWHERE | {MissionEvent.EDGE: BACKING_OFF, MissionEvent.FIND: SETTLING},
         HELD: _SURVEYING | {MissionEvent.FIND: SETTLING},
         DONE: {},
         **dict.fromkeys(AMONG_BEACONS, _ANYWHERE),

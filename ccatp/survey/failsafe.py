@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 REDUCED = Severity.SLOW, RETURN
 CORNERS = frozenset(Corner)
+# Signals of findings after which what the wheels show is still right: edge sensors, and missing encoder samples, for
+# which the localizer accounts by itself.
+KEEPS_ODOMETRY = frozenset((*CORNERS, "enc"))
 
 
 def is_denied(v: Verdict) -> bool:
@@ -59,7 +62,7 @@ def _fault(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bo
 
 
 def _hold(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
-    return rules.await_recovery(s, v.cause, rejects_odometry=v.signal not in CORNERS), True
+    return rules.await_recovery(s, v.cause, rejects_odometry=v.signal not in KEEPS_ODOMETRY), True
 
 
 def pause(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:

@@ -64,7 +64,8 @@ class StateEstimate(msgspec.Struct, frozen=True):
     ``creep``: drift (dx, dy) per metre of travel, in the plane of ``pose``. ``ahead``: predicted state, in the same
     plane, when the twist decided now takes effect; ``None``: at once. Steering uses ``ahead``; arrival and rest are
     judged by ``pose``. ``sigma_of``: standard deviation of the position in its worst direction, m. ``turn_creep_of``:
-    downhill creep per radian of a turn, mean over all headings, m.
+    downhill creep per radian of a turn, mean over all headings, m. ``gap_s``: time without encoder samples since the
+    last fix.
     """
 
     t_s: float
@@ -78,6 +79,7 @@ class StateEstimate(msgspec.Struct, frozen=True):
     sigma_of: Callable[[], float] = float  # likewise
     heading_sigma_of: Callable[[], float] = float
     turn_creep_of: Callable[[], float] = float
+    gap_s: float = 0.0
 
     @property
     def steered(self) -> Predicted:

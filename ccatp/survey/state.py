@@ -133,6 +133,7 @@ class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forb
     budget: BudgetProgress = BudgetProgress()
     is_found: bool = False  # a fix has just relocalized the robot
     backoffs: int = 0
+    is_confirmed: bool = False  # a fix was taken since a way was found last
     stands_until_s: float = -inf  # no motion before then
     recoveries_s: tuple[float, ...] = ()  # times of the recent divergences of the estimate
 

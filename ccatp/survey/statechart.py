@@ -1,6 +1,7 @@
 """The statechart of a survey: from pose, verdict and events to the next state and a command. Pure."""
 
 from collections.abc import Sequence
+from math import hypot
 
 from msgspec.structs import replace
 
@@ -145,7 +146,12 @@ class Survey(HoldRules[SurveyState]):
 
     def lose_pose(self, s: SurveyState, *, doubts_odometry: bool = True) -> SurveyState:
         """Relocalize before the next move; ``doubts_odometry`` inflates the covariance."""
-        return replace(s, fix=FixNeed.RELOCALIZE, inflates_covariance=s.inflates_covariance or doubts_odometry)
+        return replace(
+            s,
+            fix=FixNeed.RELOCALIZE,
+            heading_legs_left=MOST_LEGS,
+            inflates_covariance=s.inflates_covariance or doubts_odometry,
+        )
 
     def proceed(self, s: SurveyState) -> SurveyState:
         """Change to the next task: relocalize, go home, drive to the next stop, or finish."""
@@ -180,6 +186,8 @@ class Survey(HoldRules[SurveyState]):
     # -- legs ---------------------------------------------------------------------------------------------------------
 
     def _travel(self, s: SurveyState, motion: StateEstimate) -> Step:
+        if motion.gap_s > 0.0 and self._is_unsupported(s, motion):
+            return self._find(s), HOLD_POSITION
         if s.fix is not FixNeed.NONE:
             return self._show_heading(s, motion)
         if s.is_review_due:
@@ -202,6 +210,28 @@ class Survey(HoldRules[SurveyState]):
             return self._arrive(s, motion)
         s = self.proceed(replace(s, stop_index=s.stop_index + 1))
         return self._travel(s, motion)
+
+    def _is_unsupported(self, s: SurveyState, motion: StateEstimate) -> bool:
+        """Whether a gap of the encoder samples leaves the pose too uncertain for the leg.
+
+        On the way to a point its arrival has to be certain, on the way home the clearance from the rim.
+        """
+        mission, behaviour = self.cfg.mission, s.behaviour
+        stop = behaviour.stop if isinstance(behaviour, Leg) else s.stop
+        limit_m, aside_m = mission.arrival_tolerance_m, self.follower.distance_m(stop, motion.pose)
+        if s.mode is RETURNING:
+            limit_m, aside_m = mission.leg_clearance_m, mission.longest_leg_m
+        return _SURE_SIGMAS * hypot(motion.sigma_of(), aside_m * motion.heading_sigma_of()) > limit_m
+
+    def _find(self, s: SurveyState) -> SurveyState:
+        """Stand for a fix, which needs no motion."""
+        return self.apply(replace(self.lose_pose(s, doubts_odometry=False), behaviour=None), MissionEvent.FIND)
+
+    def _without_way(self, s: SurveyState, cause: str) -> SurveyState:
+        """No way leads on: the estimate may be wrong, so a fix comes before giving up."""
+        if s.is_confirmed:
+            return self.fault(replace(s, is_confirmed=False), cause)
+        return self._find(replace(s, is_confirmed=True))
 
     def _follow(self, s: SurveyState, motion: StateEstimate, stop: Stop) -> tuple[SurveyState, MissionCommand | None]:
         """One frame of the leg to a stop; no command when the stop is reached."""
@@ -274,8 +304,8 @@ class Survey(HoldRules[SurveyState]):
             planner, over = self.planner, {*s.done, *s.skipped}
             route = planner.route(deck, due) if due else planner.rejoin(s.route, deck, over)
         except PlanError as error:
-            return self.fault(s, conditions.NO_WAY_ON.text(why=error))
-        return replace(s, route=route, stop_index=0, behaviour=None, is_off_route=False)
+            return self._without_way(s, conditions.NO_WAY_ON.text(why=error))
+        return replace(s, route=route, stop_index=0, behaviour=None, is_off_route=False, is_confirmed=False)
 
     def _review_time(self, s: SurveyState, motion: StateEstimate) -> tuple[SurveyState, bool]:
         """After a point, leave out the points for which there is no time; false if the robot has to go home now."""
@@ -338,11 +368,14 @@ class Survey(HoldRules[SurveyState]):
 
     def _return(self, s: SurveyState, motion: StateEstimate) -> Step:
         home = s.behaviour
+        if motion.gap_s > 0.0 and self._is_unsupported(s, motion):
+            return self._find(s), HOLD_POSITION
         if not isinstance(home, ReturnHome):
             try:
-                return replace(s, behaviour=ReturnHome(self.planner.home(motion.deck))), HOLD_POSITION
+                stops = self.planner.home(motion.deck)
             except PlanError as error:
-                return self.fault(s, conditions.NO_WAY_HOME.text(why=error)), HOLD_POSITION
+                return self._without_way(s, conditions.NO_WAY_HOME.text(why=error)), HOLD_POSITION
+            return replace(s, behaviour=ReturnHome(stops), is_confirmed=False), HOLD_POSITION
         if home.is_at_base:
             s = self.apply(replace(s, outcome=SurveyOutcome.AT_BASE), MissionEvent.FINISHED)
             return s, MissionCommand(STILL, at_rest=True)
@@ -359,7 +392,7 @@ class Survey(HoldRules[SurveyState]):
             case EstimateDiverged(cause, t_s):
                 s = self._recover(s, cause, t_s)
             case TrackingGap():
-                s = replace(s, fix=FixNeed.RELOCALIZE, heading_legs_left=MOST_LEGS)
+                s = self.lose_pose(s, doubts_odometry=False)
             case EmergencyKnown():
                 s = replace(s, emergency_epoch=None)
             case TakenOver():

@@ -1,5 +1,6 @@
 """The mission as stories in virtual time: an ideal robot on one panel, verdicts as told."""
 
+from collections.abc import Collection
 from itertools import product
 from math import copysign, cos, hypot, sin
 
@@ -7,8 +8,9 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.config.models import Config
-from ccatp.core import PointId, Predicted, Severity, Stop, StopKind, Twist
+from ccatp.core import DeckPose, PointId, Predicted, Severity, Stop, StopKind, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
+from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.events import (
     AMONG_BEACONS,
     Abort,
@@ -412,7 +414,7 @@ def test_what_is_switched_off_does_not_steer(config: Config, mirror: Mirror, key
     assert abs(with_it.mission.step(used, FREE).twist.omega_rad_s) > 0.1
 
 
-def test_no_way_on_and_no_way_home_are_faults(config: Config, mirror: Mirror) -> None:
+def test_where_no_way_leads_on_or_home_a_fix_comes_before_the_fault(config: Config, mirror: Mirror) -> None:
     story = Story(config, mirror)
 
     def refuse(*_: object) -> Route:
@@ -424,12 +426,87 @@ def test_no_way_on_and_no_way_home_are_faults(config: Config, mirror: Mirror) ->
     story.mission.handle(PointMissed())
     story.mission.handle(Pause("operator"))
     story.mission.handle(Resume())
-    story.frame()
-    assert story.state.is_faulted
-    assert story.state.cause == "no way on: walled in"
-    story.mission.handle(Abort("fire"))
-    story.frame()
-    assert story.state.cause == "no way home: walled in"
+    for event, cause in ((None, "on"), (Resume(), "on"), (Abort("fire"), "home")):
+        if event is not None:
+            story.mission.handle(event)
+        story.frame()
+        assert story.state.mode is MissionState.SETTLING
+        begun = len(story.orders)
+        story.until(lambda: story.state.is_faulted)
+        assert [order.measure for order in story.orders[begun:]].count(True) == 1
+        assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[begun:])
+        assert story.state.cause == f"no way {cause}: walled in"
+
+
+def test_a_robot_whose_estimate_is_beyond_the_rim_continues_after_a_fix(config: Config, mirror: Mirror) -> None:
+    story = Story(config, mirror)
+
+    def rejoin(route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
+        if not [order for order in story.orders if order.measure]:
+            raise PlanError("start is 0.2 m beyond the rim")
+        return story.plan_rest(route, start, skip)
+
+    story.mission = Mission(Survey(config, mirror, story.route_of(story.stops), story.planner(rejoin=rejoin)))
+    story.until_state(MissionState.DRIVING)
+    story.mission.handle(Pause("operator"))
+    story.mission.handle(Resume())
+    story.finish()
+    assert len(story.plans) == 1
+
+
+class Gap(Story):
+    """A story with a gap in the encoder samples, until the next fix."""
+
+    gap_s, sigma_m, heading_sigma_rad = 0.0, 0.0, 0.0
+
+    def motion(self) -> StateEstimate:
+        sigmas = {"sigma_of": lambda: self.sigma_m, "heading_sigma_of": lambda: self.heading_sigma_rad}
+        return replace(super().motion(), gap_s=self.gap_s, **sigmas)
+
+    def frame(self, verdict: Verdict | None = FREE) -> MissionCommand:
+        order = super().frame(verdict)
+        if order.measure:
+            self.gap_s = self.sigma_m = self.heading_sigma_rad = 0.0
+        return order
+
+    def open(self, sigma_m: float, heading_sigma_rad: float) -> None:
+        self.gap_s, self.sigma_m, self.heading_sigma_rad = 0.1, sigma_m, heading_sigma_rad
+
+
+@pytest.mark.parametrize(("sigma_m", "heading_sigma_rad"), [(0.0034, 0.0), (0.0, 0.03), (0.003, 0.02)])
+def test_after_a_gap_that_leaves_the_arrival_uncertain_a_fix_comes_before_the_next_move(
+    config: Config, mirror: Mirror, sigma_m: float, heading_sigma_rad: float
+) -> None:
+    story = Gap(config, mirror)
+    story.drive_on()
+    story.open(sigma_m, heading_sigma_rad)
+    begun = len(story.orders)
+    story.until(lambda: story.orders[-1].measure)
+    assert story.state.done == ()  # that fix was none of a point
+    assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[begun:])
+    story.finish()
+
+
+def test_a_gap_that_leaves_the_arrival_certain_costs_nothing(config: Config, mirror: Mirror) -> None:
+    story = Gap(config, mirror)
+    story.drive_on()
+    story.open(0.001, 0.005)
+    story.finish()
+    assert story.plans == []
+
+
+@pytest.mark.parametrize(("sigma_m", "stands"), [(0.02, False), (0.04, True)])
+def test_on_the_way_home_a_gap_has_to_leave_the_clearance_from_the_rim(
+    config: Config, mirror: Mirror, sigma_m: float, stands: bool
+) -> None:
+    story = Gap(config, mirror)
+    story.drive_on()
+    story.until(lambda: story.state.mode is MissionState.RETURNING and story.v > 0.05, ABORT)
+    story.open(sigma_m, 0.0)
+    story.frame(ABORT)
+    assert (story.state.mode is MissionState.SETTLING) is stands
+    story.until_state(MissionState.DONE, ABORT)
+    assert story.state.outcome is SurveyOutcome.AT_BASE
 
 
 def test_eta_falls_as_stops_are_done(story: Story) -> None:
