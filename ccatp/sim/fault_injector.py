@@ -58,6 +58,9 @@ def _act_on_side(
         case "runaway":
             is_changed = rates[k] != fault.rate_rad_s
             rates[k] = fault.rate_rad_s
+        case "gain":
+            is_changed = rates[k] != 0.0
+            rates[k] *= fault.factor
         case "slip":
             is_changed = not plant.are_wheels_still or any(rates)
             grip[k] *= fault.factor

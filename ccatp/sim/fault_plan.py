@@ -144,9 +144,12 @@ _ON_SENSORS = _types(
         "non_finite": {"token": Literal["NaN", "Infinity", "1e999"]},
     },
 )
-# The wheel stands still, or turns at ``rate_rad_s``, independent of its set point; slip: the travel that one wheel (or
-# both) gives the body is multiplied by ``factor``.
-_ON_WHEELS = _types(LastingFault, {"blocked": {}, "runaway": {"rate_rad_s": float}, "slip": _SLIP})
+# The wheel stands still or turns at ``rate_rad_s``, independent of its set point, or turns at ``factor`` times that;
+# slip: the travel that one wheel (or both) gives the body is multiplied by ``factor``.
+_ON_WHEELS = _types(
+    LastingFault,
+    {"blocked": {}, "runaway": {"rate_rad_s": float}, "gain": {"factor": NonNegative}, "slip": _SLIP},
+)
 # The thrust of the fan is multiplied by ``share``; the duties in the frame do not show it.
 _ON_FANS = _types(LastingFault, {"weak": {"share": _Share}})
 

@@ -173,6 +173,13 @@ def test_a_blocked_wheel_stands_and_its_encoder_says_so(config: Config, mirror: 
     assert acted(robot) == (0.5, 0.99, 50, 50)
 
 
+def test_a_wheel_of_another_gain_turns_at_a_multiple_of_its_set_point(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="left_wheel", type="gain", factor=1.5)
+    rates = [frame["enc"][-1][1:] for frame in drive(robot, 1.0, 1.0, 1.5)]
+    assert rates[45] == pytest.approx([1.0, 1.0], abs=0.01)
+    assert rates[-1] == pytest.approx([1.0, 1.5], abs=0.01)
+
+
 def test_a_runaway_wheel_turns_while_the_robot_holds(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror, signal="left_wheel", type="runaway", rate_rad_s=-2.0, for_s=0.5)
     frames = drive(robot, 0.0, 0.0, 0.99)
