@@ -86,10 +86,10 @@ class DangerMonitor(EmergencyRules):
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def step(self, sensors: Sensors, estimate: EstimateMessage | None) -> Verdict:
-        """The verdict on a frame, with main's newest estimate. A frame that is not new gets the last verdict."""
+        """The verdict on a frame, with main's newest estimate. A frame that is not new is not judged: no motion."""
         seq = sensors.seq
         if seq <= self._frame_seq:
-            return self.verdict
+            return self.stale(seq, sensors.t)
         edges, origin, time, board = self._edges, self._origin, self._time, self._board
         t_s = time.at(seq, sensors.t)
         sensors = self._with_possible_times(sensors, t_s)

@@ -29,6 +29,7 @@ from ccatp.danger import DangerMonitor
 from ccatp.errors import ExitStatus
 from ccatp.links.beacon_messages import decode_beacon_frame
 from ccatp.links.bus import EstimateSubscriber
+from ccatp.links.frame_answers import PermitRule
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import DangerEvent, EstimateMessage
@@ -158,8 +159,8 @@ class DangerLoop(RobotLoop):
             frozenset(),
         )
         self._seq, self._t_s = -1, 0.0
-        self._bad_lines = self._permit_seq = 0
-        self._sent: tuple[int, Verdict] | None = None  # frame and verdict of the last permit of the session
+        self._bad_lines = 0
+        self._permits = PermitRule()
         self._is_stale = False
         self._observatory = ObservatoryServer(
             args.endpoints.of("emergency"),
@@ -181,14 +182,16 @@ class DangerLoop(RobotLoop):
         self.log.info("danger_statistics", **self.monitor.counts)
 
     def on_joined(self, hello: Hello) -> None:
-        if self.has_rebooted:
-            self.monitor.reset()
-            self._estimates.reset()
-            self._seq = -1
-        self._sent = None
+        self._permits.begin_session()
         self.begin_session()
         port = self.robot_cfg.port
         self.log.info("robot_joined", port=port, lockstep=hello.lockstep, session=self.sessions)
+
+    def on_restarted(self) -> None:
+        self.monitor.reset()
+        self._estimates.reset()
+        self._permits.restart()
+        self._seq = -1
 
     def on_lost(self, reason: str) -> None:
         self.heartbeat.phase = "rejoining"
@@ -209,6 +212,10 @@ class DangerLoop(RobotLoop):
         is_lockstep = self.is_lockstep
         self._seq, self._t_s, self.heartbeat.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         self._bad_lines = 0
+        if not self._permits.take(self.frame_id(sensors)):
+            # The last frame of the session before: its samples are not taken twice.
+            self._publish_verdict(self.monitor.stale(sensors.seq, sensors.t), sensors.seq)
+            return
         estimate = self._estimates.latest(sensors.seq, is_lockstep=is_lockstep)
         try:
             verdict = self._judge(sensors, raw, estimate)
@@ -234,17 +241,16 @@ class DangerLoop(RobotLoop):
             self._publish_verdict(verdict, self._seq)
 
     def answer_again(self) -> None:
-        if self._sent is not None:
-            self._permit_seq += 1
-            ack, verdict = self._sent
-            self.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
+        permit = self._permits.permit()
+        if permit is not None:
+            self.link.send_permit(permit.seq, permit.ack, permit.forward, permit.reverse, permit.turn)
 
     def report_overdue(self, text: str) -> None:
         self.log.warning("frame_overdue", text=text)
 
     def _publish_verdict(self, verdict: Verdict, ack: int) -> None:
         if ack >= 0:  # the permit first, without waiting for the publication
-            self._sent = ack, verdict
+            self._permits.judge(verdict)
             self.answer_again()
         self.publisher.send("verdict", verdict)
         if not (verdict.cause or self._published[1]):  # still no cause, so there is no finding either

@@ -28,6 +28,7 @@ from ccatp.links.channels import (
     format_ok,
     parse_operator,
 )
+from ccatp.links.frame_answers import DriveRule
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
 from ccatp.links.topics import ESTIMATE_FRAMES, DangerEvent, MissionStatus
@@ -108,8 +109,7 @@ class MainLoop(RobotLoop):
         self.peer = self._verdicts = VerdictSubscriber(context, danger, timeout_s, self.heartbeat.publish_if_due)
         self.clock = MissionClock(10.0 * cfg.run.step_s if isinstance(cfg, RadioConfig) else cfg.health.clock_jump_s)
         self.frame_period_s = 0.0
-        self._is_new_session, self._drive_seq = False, 0
-        self._sent: tuple[int, DriveCommand] | None = None  # frame and command of the last drive of the session
+        self._is_new_session, self._drives = False, DriveRule()
         self._catches_up_until_s = -inf
         self._was_at_rest = False
         self._levels_sent = 0
@@ -146,18 +146,20 @@ class MainLoop(RobotLoop):
         except ConfigError as error:
             self._fail(error)
             return
-        self.frame_period_s, self._is_new_session, self._sent = 1.0 / hello.frame_hz, True, None
+        self.frame_period_s, self._is_new_session = 1.0 / hello.frame_hz, True
+        self._drives.begin_session()
         self._runner.begin_session(hello)
         self.begin_session()
         again = " again" if self.sessions > 1 else ""
         robot = self.robot_cfg
         self._telemetry.notify_operator("info", f"joined the robot at {robot.host}:{robot.port}{again}")
-        if self.has_rebooted:
-            self._telemetry.notify_operator("warning", "the robot restarted: relocalizing before it moves")
-            self._verdicts.reset()
-            self._telemetry.continue_numbering()
-            self.clock.reset()
-            self._runner.on_tracking_gap()
+
+    def on_restarted(self) -> None:
+        self._telemetry.notify_operator("warning", "the robot restarted: relocalizing before it moves")
+        self._verdicts.reset()
+        self._telemetry.continue_numbering()
+        self.clock.reset()
+        self._runner.on_tracking_gap()
 
     def on_lost(self, reason: str) -> None:
         if self.over.is_set():
@@ -357,6 +359,7 @@ class MainLoop(RobotLoop):
         if self.over.is_set():
             return
         runner, clock, seq, begun_s = self._runner, self.clock, sensors.seq, time.perf_counter()
+        self._drives.take(seq)
         try:
             is_first = self._is_new_session
             is_going_on = is_first and clock.has_begun
@@ -424,19 +427,16 @@ class MainLoop(RobotLoop):
 
     def send_drive(self, ack: int, drive: DriveCommand) -> None:
         """Send the drive that was computed from frame ``ack``."""
-        self._drive_seq += 1
-        ack, right, left = max(ack, 0), drive.right_rad_s, drive.left_rad_s
-        self.link.send_drive(self._drive_seq, ack, right, left, drive.steer_rad)
-        self._sent = ack, drive
-        self._runner.on_drive(self._drive_seq, right, left)
+        sent = self._drives.drive(ack, drive.right_rad_s, drive.left_rad_s, drive.steer_rad)
+        self.link.send_drive(sent.seq, sent.ack, sent.wr, sent.wl, sent.steer)
+        self._runner.on_drive(sent.seq, sent.wr, sent.wl)
         if not self.is_lockstep:
-            self._frame_age.add_drive(self._drive_seq, time.monotonic())
+            self._frame_age.add_drive(sent.seq, time.monotonic())
 
     def answer_again(self) -> None:
-        if self._sent is not None:
-            self._drive_seq += 1
-            ack, drive = self._sent
-            self.link.send_drive(self._drive_seq, ack, drive.right_rad_s, drive.left_rad_s, drive.steer_rad)
+        sent = self._drives.repeat()
+        if sent is not None:
+            self.link.send_drive(sent.seq, sent.ack, sent.wr, sent.wl, sent.steer)
 
     def _answer(self, seq: int, drive: DriveCommand) -> None:
         # Only a standing robot waits for its answer.

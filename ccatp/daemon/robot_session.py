@@ -8,6 +8,7 @@ from math import inf
 from ccatp.config.files import read_key
 from ccatp.config.models import LinkConfig
 from ccatp.errors import DaemonUnreachableError
+from ccatp.links.frame_answers import MAX_DRIFT, FrameId, is_restart
 from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout
 from ccatp.links.robot_messages import CommandEcho, Hello, Role, Sensors
 
@@ -17,8 +18,6 @@ FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0
 ATTEMPT_S, SHORTEST_ATTEMPT_S = 2.0, 0.25
 # Refusals that another attempt does not change.
 FINAL = ("bad mac", "bad protocol")
-# The rate of the robot's clock may be wrong by 1 % and may change; that of the host is much better.
-MAX_DRIFT = 1.02e-2
 # Number of drives whose times are stored: ten seconds at 100 Hz.
 SENT_DRIVES = 1024
 
@@ -32,17 +31,20 @@ class RobotSession(ABC):
     """Keeps a role at the robot over successive sessions; a subclass handles the events.
 
     ``sessions``: their number so far. ``hello``: of the newest session. ``is_lockstep``: simulated time waits for the
-    answers; false before the first session. ``has_rebooted``: the robot restarted since the last session.
+    answers; false before the first session.
     """
 
     def __init__(self, cfg: LinkConfig, role: Role, client: str) -> None:
         self.robot_cfg, self._role, self._client, self._key = cfg, role, client, read_key(cfg.key_file)
         self._lost = asyncio.Event()
-        self._is_joined = self.has_rebooted = self.is_lockstep = False
+        self._is_joined = self.is_lockstep = False
         # A session without a valid frame counts as a failure.
         self._failures = self.sessions = 0
         self._deadline_s: float | None = None
         self.hello: Hello | None = None
+        # The newest frame of the last session that had frames, and when this session was lost.
+        self._before: FrameId | None = None
+        self._lost_s = 0.0
         self.link = self._make()
 
     @abstractmethod
@@ -56,6 +58,9 @@ class RobotSession(ABC):
     @abstractmethod
     def on_lost(self, reason: str) -> None:
         """Handle the loss of the session; the robot holds itself."""
+
+    def on_restarted(self) -> None:  # noqa: B027 - a client without memory has nothing to forget
+        """The robot restarted since the last session: its numbers and clock began again. Before the first frame."""
 
     def on_bad_line(self) -> None:  # noqa: B027 - nothing has to be done
         """Handle an invalid line."""
@@ -75,7 +80,12 @@ class RobotSession(ABC):
             on_joined=self._handle_join,
             on_bad_line=self.on_bad_line,
             on_repeated=self.on_repeated,
+            on_first=self._handle_first,
         )
+
+    def frame_id(self, sensors: Sensors) -> FrameId:
+        """The identity of a frame of the present session."""
+        return FrameId(-1 if self.hello is None else self.hello.boot, self.sessions, sensors.seq, sensors.t)
 
     async def join(self, *, is_patient: bool) -> None:
         """Join for the first time. Raises ``DaemonUnreachableError``: the robot does not answer, or refuses.
@@ -122,14 +132,21 @@ class RobotSession(ABC):
         raise RobotTimeout(f"the robot did not come back within {self.robot_cfg.reconnect_timeout_s:g} s: {why}")
 
     def _handle_join(self, hello: Hello) -> None:
-        self.has_rebooted = self.hello is not None and self.hello.boot != hello.boot
         self.hello, self.is_lockstep = hello, hello.lockstep
         self._is_joined = True
         self.sessions += 1
         self.on_joined(hello)
 
+    def _handle_first(self, sensors: Sensors) -> None:
+        """Compare the first frame of a session with the newest one before: only now a restart shows for certain."""
+        away_s = 0.0 if self.is_lockstep else asyncio.get_running_loop().time() - self._lost_s
+        if self._before is not None and is_restart(self._before, self.frame_id(sensors), away_s):
+            self.on_restarted()
+
     def _handle_loss(self, reason: str) -> None:
         self._is_joined = False
+        if self.link.newest is not None:
+            self._before, self._lost_s = self.frame_id(self.link.newest), asyncio.get_running_loop().time()
         self._lost.set()
         self.on_lost(reason)
 

@@ -103,11 +103,12 @@ class RobotLink(asyncio.Protocol):
 
     ``on_sensors`` is called with each frame and its line (without LF), within the event loop's read; ``on_lost`` once
     with the reason when a joined session ends, unless ``close`` ended it; ``on_joined`` with the robot's hello when the
-    session begins, before its first frame; ``on_bad_line`` after each line of a joined session that fails a check;
-    ``on_repeated`` when its newest frame comes again.
+    session begins, before its first frame; ``on_first`` with its first frame, before ``on_sensors``; ``on_bad_line``
+    after each line of a joined session that fails a check; ``on_repeated`` when its newest frame comes unchanged again.
 
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
+        newest: the newest frame of the session.
     """
 
     def __init__(
@@ -123,10 +124,11 @@ class RobotLink(asyncio.Protocol):
         on_joined: Callable[[Hello], None] = lambda _hello: None,
         on_bad_line: Callable[[], None] = lambda: None,
         on_repeated: Callable[[], None] = lambda: None,
+        on_first: Callable[[Sensors], None] = lambda _sensors: None,
     ) -> None:
         self._host, self._port, self._role, self._client, self._key = host, port, role, client, key
         self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
-        self._on_bad_line, self._on_repeated = on_bad_line, on_repeated
+        self._on_bad_line, self._on_repeated, self._on_first = on_bad_line, on_repeated, on_first
         self.counts: Counter[str] = Counter()
         self._transport: asyncio.Transport | None = None
         self._writer: LineWriter | None = None
@@ -137,6 +139,7 @@ class RobotLink(asyncio.Protocol):
         self._bad = BadLineCounter()
         self._budget: BadLineLimit | None = None
         self._last_seq = -1
+        self.newest: Sensors | None = None
         self._why = self._oddity = ""
 
     @property
@@ -197,7 +200,9 @@ class RobotLink(asyncio.Protocol):
                 self._count_bad(self._oddity)
                 continue
             if type(message) is Sensors and self._is_joined and message.seq > self._last_seq:
-                self._last_seq = message.seq
+                if self._last_seq < 0:
+                    self._on_first(message)
+                self._last_seq, self.newest = message.seq, message
                 self._on_sensors(message, line)
             else:
                 self._take(message)
@@ -229,7 +234,8 @@ class RobotLink(asyncio.Protocol):
             self.counts["unknown_types"] += 1
         elif isinstance(message, Sensors):
             self.counts["repeated_frames" if self._is_joined else "unexpected"] += 1
-            if self._is_joined and message.seq == self._last_seq:
+            newest = self.newest if self._is_joined else None
+            if newest is not None and (message.seq, message.t) == (newest.seq, newest.t):
                 self._on_repeated()
         elif joining is None or joining.done():
             self.counts["unexpected"] += 1

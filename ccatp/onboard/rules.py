@@ -174,6 +174,8 @@ class LinkedRobot(ABC):
     when it arrives; sequence numbers count per kind and session.
 
     Attributes:
+        reboots: restarts of a simulated robot so far.
+        boot_count: those that its boot number shows.
         delivered_seq: number of the frame that reached the clients at this instant; -1 before the first, or if a fault
             removed it.
     """
@@ -186,7 +188,8 @@ class LinkedRobot(ABC):
         self._limits = limits
         self.frame_s, self.frame_hz = frame_s, frame_hz
         self.commands_delay_frames = commands_delay_frames
-        self.seq, self.t_s, self.reboots = 0, 0.0, 0
+        self.seq, self.t_s = 0, 0.0
+        self.reboots = self.boot_count = 0
         self.delivered_seq = -1
         self._boot()
 

@@ -149,7 +149,7 @@ class RobotServer:
     def accept(self, session: RobotSession, now_s: float) -> None:
         """Send the hello to a client that has connected; refuse it when there are too many sessions."""
         session.joined_s = session.received_s = now_s
-        auth, boot = AUTH_NONE if self._key is None else AUTH_HMAC, self._boot + self._reboots
+        auth, boot = AUTH_NONE if self._key is None else AUTH_HMAC, self._boot + self.robot.boot_count
         session.write(encode(self.robot.hello(boot=boot, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep)))
         self._sessions.add(session)
         if len(self._sessions) > MAX_SESSIONS:

@@ -110,7 +110,9 @@ class BeaconSafetyRules(EmergencyRules):
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def step(self, sensors: Sensors, extras: BeaconFrame, estimate: EstimateMessage | None) -> Verdict:
-        """The verdict on one frame."""
+        """The verdict on one frame. A frame that is not new is not judged: no motion is permitted."""
+        if sensors.seq <= self._frame_seq:
+            return self.stale(sensors.seq, sensors.t)
         self._frame_seq = sensors.seq
         self._take_readings(sensors.t, extras)
         self._roll(sensors, extras)

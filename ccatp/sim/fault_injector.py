@@ -296,12 +296,12 @@ class Injector:
         glide_m = record.fault.speed_m_s * dt_s / slope
         return forward_m + glide_m * ahead, left_m + glide_m * aside, turn_rad
 
-    def is_rebooting(self, t_s: float) -> bool:
-        """Whether the robot reboots now; true once for each planned reboot."""
+    def reboots(self, t_s: float) -> list[Any]:
+        """The planned reboots that are due now; each is due once."""
         due = [record for record in self._on["robot"] if record.fault.has_begun(t_s) and not record.samples]
         for record in due:
             record.add(t_s)
-        return bool(due)
+        return [record.fault for record in due]
 
     def reboot(self, seq: int, t_s: float) -> None:
         """Count frames from ``seq`` and times from ``t_s`` from now on."""

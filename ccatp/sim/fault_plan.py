@@ -171,8 +171,9 @@ TYPES: dict[str, dict[str, type[InjectedFault]]] = {
     ),
     # The robot itself reports ``names`` in its frames.
     "faults": _types(LastingFault, {"raise": {"names": Annotated[tuple[_RaisedName, ...], Field(min_length=1)]}}),
-    # The robot reboots: boot number, clock, sequence numbers and fans; every session is lost.
-    "robot": _types(InjectedFault, {"reboot": {}}),
+    # The robot reboots: boot number (unless its firmware does not count boots), clock, sequence numbers and fans; every
+    # session is lost.
+    "robot": _types(InjectedFault, {"reboot": {"keeps_number": (bool, False)}}),
 }
 """The types that each signal takes."""
 

@@ -89,8 +89,8 @@ class Robot(LinkedRobot, SurveyTruth):
     def advance(self) -> None:
         before_s = self.t_s
         injector = self.injector
-        if injector is not None and injector.is_rebooting(before_s):
-            self._reboot(injector)
+        if injector is not None and (due := injector.reboots(before_s)):
+            self._reboot(injector, keeps_number=all(fault.keeps_number for fault in due))
         self._release_commands()
         self.seq += 1
         self.t_s = t_s = self.seq / self.frame_hz
@@ -103,10 +103,11 @@ class Robot(LinkedRobot, SurveyTruth):
         self.world.step(before_s, self.frame_s, right, left, self.fans.thrust)
         self._read()
 
-    def _reboot(self, injector: Injector) -> None:
+    def _reboot(self, injector: Injector, *, keeps_number: bool) -> None:
         """Discard all commands and undelivered frames; the fans go to their floor."""
         health = self.fans.health
         self.reboots += 1
+        self.boot_count += not keeps_number
         self._boot()
         self.fans.health = health
         self._frames.clear()

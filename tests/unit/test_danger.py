@@ -413,12 +413,15 @@ def test_no_frame_permits_nothing_whatever_the_code(at_rim: Story) -> None:
     assert at_rim.monitor.stale(7, 1.5).code is EventCode.NEAR_EDGE
 
 
-def test_a_frame_that_is_not_new_changes_nothing(at_rim: Story) -> None:
+def test_a_frame_that_is_not_new_is_not_judged_and_permits_nothing(at_rim: Story) -> None:
     at_rim.run(2)
     last = at_rim.monitor.verdict
+    assert permits(last) != NO_PERMIT
     t_s = at_rim.t
     again = frame_of(2, t_s, [WheelSample(t_s, 9.0, 9.0)], [EdgeSample(t_s + 1e-3 * k, 0, 0, 0, 0) for k in range(5)])
-    assert at_rim.monitor.step(again, None) is last
+    found = at_rim.monitor.step(again, None)
+    assert (permits(found), found.cause) == (NO_PERMIT, "no sensors frame")
+    assert at_rim.monitor.verdict is last
     assert at_rim.monitor._edges.is_idle
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from ccatp.conditions import LASER_NOT_READY
 from ccatp.config.load import load_config
@@ -24,15 +25,17 @@ from ccatp.daemon.robot_session import (
     delay_s,
 )
 from ccatp.estimation.fixes import FixGated, FixRefused
-from ccatp.links.robot_codec import encode
+from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_link import RobotTimeout
 from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Sensors
 from ccatp.links.topics import FixMessage
 from ccatp.records.store import AlreadyMeasuredError
 from ccatp.survey.events import FixStored, SurveyInput
+from tests.faults.linking import Measured
 from tests.support.daemon import HELLO, Waiting
 from tests.support.scenario import SurveyLoop
 from tests.support.sim_survey import fix_service
+from tests.support.sockets import scripted
 
 
 def test_the_delay_grows_and_is_spread() -> None:
@@ -50,6 +53,7 @@ class Client(RobotSession, Waiting):
         self.hellos: list[Hello] = []
         self.frames: list[int] = []
         self.losses: list[str] = []
+        self.restarts: list[int] = []  # number of frames before each
         self.changed = asyncio.Event()
 
     def on_joined(self, hello: Hello) -> None:
@@ -57,6 +61,9 @@ class Client(RobotSession, Waiting):
 
     def on_lost(self, reason: str) -> None:
         self.losses.append(reason)
+
+    def on_restarted(self) -> None:
+        self.restarts.append(len(self.frames))
 
     def on_sensors(self, sensors: Sensors, _line: bytes) -> None:
         self.frames.append(sensors.seq)
@@ -90,11 +97,56 @@ async def test_a_lost_session_is_followed_by_another_one_with_the_same_frame() -
         client.drop("silent")
         await client.until(lambda: len(client.frames) == 5)
         assert client.losses[-1] == "silent"
+        assert not client.restarts
         serving.cancel()
         client.leave()
         await asyncio.gather(serving, return_exceptions=True)
 
     await with_robot(story)
+
+
+def line(seq: int, t_s: float) -> bytes:
+    echo = CommandEcho(0, 0.0, 0.0, held=True)
+    return encode(RobotFrame(seq, t_s, [], [], [], None, (0.5, 0.5), 1.0, echo, ()))
+
+
+@pytest.mark.fault("L21")
+@pytest.mark.parametrize(
+    ("boot", "seq", "t_s", "restarts"),
+    [
+        (1, 500, 5.0, []),
+        (1, 501, 5.01, []),
+        (2, 501, 5.01, [2]),
+        (1, 1, 0.01, [2]),
+        (1, 499, 5.5, [2]),
+        (1, 900, 4.0, [2]),
+    ],
+)
+async def test_a_restart_shows_in_the_first_frame_of_a_session_also_with_the_same_boot_number(
+    boot: int, seq: int, t_s: float, restarts: list[int], measured: Measured
+) -> None:
+    sessions = iter([(1, [line(499, 4.99), line(500, 5.0)]), (boot, [line(seq, t_s), line(seq + 1, t_s + 0.01)])])
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        number, frames = next(sessions)
+        writer.write(encode(replace(HELLO, boot=number)))
+        await reader.readline()
+        writer.write(encode(Joined(role="controller", session=number)) + b"".join(frames))
+        await writer.drain()
+        if frames[0] == line(499, 4.99):
+            return
+        await reader.read()
+
+    async with scripted(talk) as port:
+        client = Client(load_config(overrides={"robot.port": port}))
+        await client.join(is_patient=False)
+        serving = asyncio.create_task(client.serve())
+        await client.until(lambda: len(client.frames) == 4)
+        serving.cancel()
+        client.leave()
+        await asyncio.gather(serving, return_exceptions=True)
+    assert client.restarts == restarts
+    measured("L21", max((count - 2 for count in client.restarts), default=0))
 
 
 @pytest.mark.fault("L1")

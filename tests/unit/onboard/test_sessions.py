@@ -292,8 +292,10 @@ def test_a_robot_that_is_never_heard_again_ends_the_session(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("lockstep", [True, False])
-def test_a_reboot_ends_every_session_and_changes_the_boot(rig: Rig, lockstep: bool) -> None:
-    r = rig(plan=fault_plan({"signal": "robot", "type": "reboot", "at_s": 0.05}), lockstep=lockstep)
+@pytest.mark.parametrize("keeps_number", [True, False])
+def test_a_reboot_ends_every_session_and_changes_the_boot(rig: Rig, lockstep: bool, keeps_number: bool) -> None:
+    reboot = {"signal": "robot", "type": "reboot", "at_s": 0.05, "keeps_number": keeps_number}
+    r = rig(plan=fault_plan(reboot), lockstep=lockstep)
     controller, monitor, visitor = r.client(JOIN), r.client(JOIN_MONITOR), r.client()
     boot = visitor.messages[0]["boot"]
     number = 0
@@ -310,6 +312,6 @@ def test_a_reboot_ends_every_session_and_changes_the_boot(rig: Rig, lockstep: bo
     assert r.robot.t_s == pytest.approx(0.06)
     assert "controller dropped: the robot rebooted" in r.notes
     hello, joined, *rest = r.client(JOIN).messages
-    assert (hello["boot"], joined["type"]) == (boot + 1, "joined")
+    assert (hello["boot"], joined["type"]) == (boot + (not keeps_number), "joined")
     if lockstep:
         assert (rest[0]["seq"], rest[0]["cmd"]["held"]) == (1, True)
