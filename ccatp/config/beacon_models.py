@@ -22,6 +22,7 @@ from ccatp.config.models import (
     ProcessesConfig,
     Seed,
 )
+from ccatp.config.robot_limits import BeaconFramePeriod, TimeToLive, WheelBase, WheelRadius
 
 # Frames come ten times a second: what is older than two of them is stale.
 SlowFreshness = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -45,7 +46,7 @@ class BeaconRobotConfig(LinkConfig):
 
     sensors_timeout_s: SlowFreshness
     lag_limit_s: SlowFreshness
-    wheel_radius_m: Annotated[float, Field(gt=0.0, le=0.5)]
+    wheel_radius_m: WheelRadius
     max_wheel_rad_s: Positive
 
 
@@ -91,7 +92,7 @@ class SimBeaconRobotConfig(Model):
 
     host: Host
     port: Port
-    ttl_s: Positive
+    ttl_s: TimeToLive
 
 
 class RadioLossConfig(Model):
@@ -234,7 +235,7 @@ class RadioRunConfig(Model):
     """One run: clock, seed, end."""
 
     seed: Seed
-    step_s: Annotated[float, Field(gt=0.0, le=1.0)]
+    step_s: BeaconFramePeriod  # one frame of the robot for each step
     steps: Count
 
 
@@ -251,7 +252,7 @@ class VehicleConfig(Model):
 
     kind: Literal["ackermann", "differential"]
     wheelbase_m: Positive
-    track_m: Positive
+    track_m: WheelBase
     speed_max_m_s: Positive
     steer_max_rad: Annotated[float, Field(gt=0.0, le=1.5)]
     turn_rate_max_rad_s: Positive

@@ -10,10 +10,11 @@ from pathlib import PurePath
 
 from pydantic import BaseModel
 
-from ccatp.config.beacon_models import CricketConfig, FuzzyConfig, RadioConfig
+from ccatp.config.beacon_models import BeaconRobotConfig, CricketConfig, FuzzyConfig, RadioConfig
 from ccatp.config.messages import ConfigProblem, Key, choice_hint, slip_hint
-from ccatp.config.models import Config, DashboardConfig, MirrorConfig
-from ccatp.config.onboard_models import OnboardConfig
+from ccatp.config.models import Config, DashboardConfig, MirrorConfig, RobotConfig
+from ccatp.config.onboard_models import OnboardConfig, OnboardRobotConfig
+from ccatp.config.robot_limits import TOP_SPEED_M_S
 
 FUZZY_INPUTS = ("distance_m", "heading_error_rad")
 
@@ -57,6 +58,7 @@ def check_radio_config(cfg: RadioConfig, *, simulates: bool = True) -> Problems:
 
     ``simulates`` says whether the field of motes is simulated; layout and places do not matter for measured ranges.
     """
+    yield from _check_top_speed(cfg.robot)
     yield from _check_fuzzy(cfg.control.fuzzy)
     yield from _check_follow(cfg)
     if simulates:
@@ -126,16 +128,13 @@ def _slips(value: object, key: Key) -> Problems:
 def check_onboard_config(cfg: OnboardConfig) -> Problems:
     """Everything wrong with a configuration of the on-board program whose values are each in range."""
     link, robot, servo, edges, devices = cfg.link, cfg.robot, cfg.servo, cfg.edges, cfg.devices
-    top_m_s, full_scale_v = robot.max_wheel_rad_s * robot.wheel_radius_m, devices.daq.full_scale_v
+    full_scale_v = devices.daq.full_scale_v
     low_v, high_v = (edges.threshold_v + side * edges.hysteresis_v for side in (-0.5, 0.5))
     supply_v = devices.motors.supply_v
+    yield from _check_top_speed(robot)
     yield from _check_corners(robot.edge_sensors_m)
     step_s, lasting_s = 1.0 / servo.loop_hz, _STEPS_OF_TIMER / servo.loop_hz
     for is_wrong, key, what, *related in (
-        (not 0.005 <= robot.wheel_radius_m <= 0.2, "robot.wheel_radius_m", "must be between 0.005 and 0.2 (the link)"),
-        (not 0.03 <= robot.wheel_base_m <= 1.0, "robot.wheel_base_m", "must be between 0.03 and 1 (the link)"),
-        (top_m_s > 1.0, "robot.max_wheel_rad_s",
-         f"= {robot.max_wheel_rad_s:g} is {top_m_s:.3g} m/s; the link allows 1", "robot.wheel_radius_m"),
         (link.frame_hz * link.ttl_s < 2.0, "link.ttl_s", "must last for two frames at least", "link.frame_hz"),
         (servo.loop_hz < link.frame_hz, "servo.loop_hz", "must not be below link.frame_hz", "link.frame_hz"),
         (lasting_s > devices.timer.timeout_s, "devices.timer.timeout_s",
@@ -157,6 +156,7 @@ def check_onboard_config(cfg: OnboardConfig) -> Problems:
 def _check_wheels(cfg: Config) -> Problems:
     """The wheels must give the motion that the limits allow; edge sensors have x to the front, y to the left."""
     robot, limits = cfg.robot, cfg.limits
+    yield from _check_top_speed(robot)
     formula, related = "max_wheel_rad_s * wheel_radius_m", ("robot.max_wheel_rad_s", "robot.wheel_radius_m")
     rim_m_s = robot.max_wheel_rad_s * robot.wheel_radius_m
     turning_rad_s = 2.0 * rim_m_s / robot.wheel_base_m
@@ -168,6 +168,15 @@ def _check_wheels(cfg: Config) -> Problems:
             what = f"= {value:g} is more than the wheels give: {of} = {limit:.4g}"
             yield _problem(key, what, *related, "robot.wheel_base_m")
     yield from _check_corners(robot.edge_sensors_m)
+
+
+def _check_top_speed(robot: RobotConfig | BeaconRobotConfig | OnboardRobotConfig) -> Problems:
+    """The robot link refuses a robot that is too fast, and one with which no mission ends."""
+    top_m_s = robot.max_wheel_rad_s * robot.wheel_radius_m
+    low, high = TOP_SPEED_M_S
+    if not low <= top_m_s <= high:
+        what = f"= {robot.max_wheel_rad_s:g} is {top_m_s:.3g} m/s; the robot link allows {low:g} to {high:g}"
+        yield _problem("robot.max_wheel_rad_s", what, "robot.wheel_radius_m")
 
 
 def _check_corners(edge_sensors_m: Sequence[tuple[float, float]]) -> Problems:

@@ -4,6 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from ccatp.config.robot_limits import FrameRate, TimeToLive, WheelBase, WheelRadius
+
 # Larger than all quantities of this project, in the units of their keys.
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 NonNegative = Annotated[float, Field(ge=0.0, le=1e6)]
@@ -82,8 +84,8 @@ class LinkConfig(Model):
 class RobotConfig(LinkConfig):
     """Address and geometry of the robot."""
 
-    wheel_radius_m: Annotated[float, Field(gt=0.0, le=0.2)]
-    wheel_base_m: Annotated[float, Field(gt=0.0, le=0.6)]
+    wheel_radius_m: WheelRadius
+    wheel_base_m: WheelBase
     edge_sensors_m: tuple[Pair, Pair, Pair, Pair]
     puck_height_m: Annotated[float, Field(ge=0.0, le=0.5)]
     max_wheel_rad_s: Positive
@@ -407,8 +409,8 @@ class SimRobotConfig(Model):
 
     host: Host
     port: Port
-    frame_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
-    ttl_s: Positive
+    frame_hz: FrameRate
+    ttl_s: TimeToLive
     imu_hz: Annotated[float, Field(gt=0.0, le=100.0)]
     encoder_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
     edge_hz: Annotated[float, Field(gt=0.0, le=1000.0)]

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ccatp.config.models import Host, Model, NonNegative, Pair, Port, Positive, Text
+from ccatp.config.robot_limits import FrameRate, TimeToLive, WheelBase, WheelRadius
 
 Line = Annotated[int, Field(ge=0, le=1023)]
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -17,16 +18,16 @@ class OnboardLinkConfig(Model):
     host: Host
     port: Port
     key_file: Text  # empty = no authentication
-    frame_hz: Annotated[float, Field(ge=10.0, le=200.0)]
-    ttl_s: Annotated[float, Field(gt=0.0, le=1.0)]
+    frame_hz: FrameRate
+    ttl_s: TimeToLive
     sample_latency_s: Annotated[float, Field(ge=0.0, le=0.05)]
 
 
 class OnboardRobotConfig(Model):
     """Data of the robot in the hello; lengths in m, robot frame."""
 
-    wheel_radius_m: Positive
-    wheel_base_m: Positive
+    wheel_radius_m: WheelRadius
+    wheel_base_m: WheelBase
     edge_sensors_m: tuple[Pair, Pair, Pair, Pair]
     puck_m: tuple[float, float, float]
     max_wheel_rad_s: Positive

@@ -9,7 +9,7 @@ from ccatp.config.files import read_key
 from ccatp.config.models import LinkConfig
 from ccatp.errors import DaemonUnreachableError
 from ccatp.links.frame_answers import MAX_DRIFT, FrameId, is_restart
-from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout
+from ccatp.links.robot_link import ImpossibleRobot, RobotLink, RobotLinkError, RobotRefused, RobotTimeout
 from ccatp.links.robot_messages import CommandEcho, Hello, Role, Sensors
 
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0
@@ -122,7 +122,7 @@ class RobotSession(ABC):
             try:
                 await self.link.connect(min(ATTEMPT_S, max(left_s, SHORTEST_ATTEMPT_S)))
             except RobotLinkError as error:
-                if isinstance(error, RobotRefused) and error.reason in FINAL:
+                if isinstance(error, ImpossibleRobot) or (isinstance(error, RobotRefused) and error.reason in FINAL):
                     raise
                 why = error
             else:

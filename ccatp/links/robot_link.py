@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import cast
 
+from ccatp.config.robot_limits import hello_problems
 from ccatp.errors import DaemonUnreachableError
 from ccatp.links.robot_codec import (
     BadLine,
@@ -53,6 +54,10 @@ class RobotRefused(RobotLinkError):
     def __init__(self, where: str, role: str, reason: str) -> None:
         super().__init__(f"the robot at {where} refused the role {role}: {reason}{_HINTS.get(reason, '')}")
         self.reason = reason
+
+
+class ImpossibleRobot(RobotLinkError):
+    """The robot has values beyond the limits of the link, ``ccatp.config.robot_limits``: no mission works with it."""
 
 
 class WrongProtocol(RobotLinkError):
@@ -256,10 +261,21 @@ class RobotLink(asyncio.Protocol):
             self.counts["unexpected"] += 1
 
     def _answer(self, hello: Hello, joining: "asyncio.Future[Hello]") -> None:
-        needs_key = hello.auth == AUTH_HMAC
+        needs_key, robot = hello.auth == AUTH_HMAC, hello.robot
+        problems = hello_problems(
+            frame_hz=hello.frame_hz,
+            ttl_s=hello.ttl_s,
+            wheel_radius_m=robot.wheel_radius_m,
+            wheel_base_m=robot.wheel_base_m,
+            max_wheel_rad_s=robot.max_wheel_rad_s,
+            is_among_beacons=robot.vehicle is not None,
+        )
         if hello.protocol != PROTOCOL:
             error = f"the robot at {self._where} speaks {hello.protocol}, this program {PROTOCOL}"
             joining.set_exception(WrongProtocol(error))
+        elif problems:
+            error = f"the robot at {self._where} cannot be driven: {'; '.join(problems)}; correct its firmware"
+            joining.set_exception(ImpossibleRobot(error))
         elif needs_key and self._key is None:
             error = f"the robot at {self._where} asks for a key: name its file in robot.key_file"
             joining.set_exception(RobotLinkError(error))

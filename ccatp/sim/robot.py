@@ -20,13 +20,12 @@ Requests for the true state (SI; puck in the world frame, start pose in the deck
 """
 
 from collections import deque
-from math import ceil
 
 import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
-from ccatp.links.robot_codec import MAX_LINE_BYTES, RobotFrame, encode
+from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, RobotData, Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.onboard.rules import LinkedRobot
@@ -37,16 +36,12 @@ from ccatp.sim.plant import WHOLE
 from ccatp.sim.sensors import SensorSuite, as_message
 from ccatp.sim.world import World
 
-# Worst case of a frame's line: fixed part, and bytes per sample of each list. Counted rates have all their digits.
-_FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48, 44, 64, 26
-
 
 class Robot(LinkedRobot, SurveyTruth):
     """The survey robot; without ``start`` it starts at base, with a drawn error.
 
     ``rng`` is the parent of all generators. ``delivered_rows``: ``delivered`` with plain tuples for samples, before the
-    faults of its delivery; do not change it. Raises ``ValueError`` if a frame may have more samples than a line can
-    hold, or is longer than the time-to-live.
+    faults of its delivery; do not change it.
     """
 
     def __init__(
@@ -54,7 +49,6 @@ class Robot(LinkedRobot, SurveyTruth):
         start: DeckPose | None = None,
     ) -> None:  # fmt: skip
         sim = cfg.sim.robot
-        _check_rates(cfg)
         world_rng, sensors_rng = rng.spawn(2)
         self._cfg = cfg
         self._floor = sim.fan_floor if mirror.overhang else 0.0
@@ -145,21 +139,3 @@ class Robot(LinkedRobot, SurveyTruth):
         if injector is not None:
             self._line, message = injector.deliver(t_s, delivered)
             self._delivered, self.delivered_seq = message, -1 if message is None else message.seq
-
-
-def _check_rates(cfg: Config) -> None:
-    sim = cfg.sim.robot
-    if sim.frame_hz * sim.ttl_s < 1.0:
-        raise ValueError(
-            f"sim.robot: a frame of {1.0 / sim.frame_hz:g} s outlasts ttl_s {sim.ttl_s:g}, it would never move: "
-            "raise frame_hz or ttl_s"
-        )
-    line_bytes = _FRAME_BYTES
-    encoder_bytes = _COUNTER_BYTES if cfg.world.encoder_counts_per_rev else _ENCODER_BYTES
-    for hz, sample_bytes in ((sim.imu_hz, _IMU_BYTES), (sim.encoder_hz, encoder_bytes), (sim.edge_hz, _EDGE_BYTES)):
-        line_bytes += ceil(hz / sim.frame_hz) * sample_bytes
-    if line_bytes > MAX_LINE_BYTES:
-        raise ValueError(
-            f"sim.robot: frames at {sim.frame_hz:g} Hz take up to {line_bytes} bytes, a line holds {MAX_LINE_BYTES}: "
-            "raise frame_hz or lower the sensors' rates"
-        )

@@ -29,7 +29,6 @@ from ccatp.survey.statechart import Mission, Survey
 # Largest difference between the configuration (calibrated) and the robot's own values (nominal).
 RADIUS_TOLERANCE = 0.05
 SENSOR_TOLERANCE_M = 0.005
-TOP_SPEED_M_S = 1.0  # interface control document 1; a higher value cannot be right
 
 # Speeds below which a robot in a standing mode is at rest.
 _STILL_M_S, _STILL_RAD_S = 0.002, 0.01
@@ -234,8 +233,6 @@ def robot_problems(cfg: Config, mirror: Mirror, hello: Hello) -> list[str]:
     puck = own.puck_m
     if hypot(puck[0], puck[1], puck[2] - robot.puck_height_m) > SENSOR_TOLERANCE_M:
         problems.append(f"the puck is at (0, 0, {robot.puck_height_m}) here and at {tuple(puck)} there")
-    if (speed_m_s := own.wheel_radius_m * own.max_wheel_rad_s) > TOP_SPEED_M_S:
-        problems.append(f"the top speed there is {speed_m_s:.3g} m/s, more than {TOP_SPEED_M_S:g}")
     if mirror.overhang and own.fan_floor <= 0.0:
         problems.append("the mirror overhangs and the robot has no fan floor")
     return problems

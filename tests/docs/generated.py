@@ -15,6 +15,7 @@ import ccatp.onboard.devices.daq
 from ccatp.beacons.mission import RULES
 from ccatp.cli import cli
 from ccatp.conditions import DANGER, SAMPLE_RATES, SURVEY, Action, Condition, Group
+from ccatp.config.robot_limits import LIMITS
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.links.topics import TOPICS
@@ -125,6 +126,12 @@ def rates() -> str:
     return table("| list | at full speed, samples/s | held below, samples/s |", rows)
 
 
+def limits() -> str:
+    """The limits of a robot."""
+    rows = [(f"`{name}`", f"{low:g}", f"{high:g}", unit) for name, ((low, high), unit) in LIMITS.items()]
+    return table("| of the `hello` | from | to | unit |", rows)
+
+
 def codes() -> str:
     """The event codes."""
     return table("| code | |", [(int(code), code.name.lower().replace("_", " ")) for code in EventCode])
@@ -184,6 +191,7 @@ MADE: dict[str, Callable[[], str]] = {
     "processes": processes,
     "codes": codes,
     "rates": rates,
+    "limits": limits,
     "commands": commands,
     "seeded": seeded,
     "daq": daq,

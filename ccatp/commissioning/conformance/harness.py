@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ccatp.config.messages import format_key
+from ccatp.config.robot_limits import FrameRate, TimeToLive, WheelBase, WheelRadius, top_speed_problem
 from ccatp.links.robot_codec import LineBuffer, encode, format_drive, format_permit, join_mac
 from ccatp.links.robot_messages import AUTH_HMAC, Fans, Join, Role
 from ccatp.mirror.mirror import Mirror
@@ -31,7 +32,6 @@ ALL: Allowed = (True, True, True)
 NOTHING: Allowed = (False, False, False)
 POLL_S = 0.05
 COMMAND_LIMIT_S = 2.0  # robot time within which a command must be in force
-TOP_SPEED_M_S = 1.0
 DUTY_TOLERANCE = 0.01  # the robot may store a duty in eight bits
 # The numbers between two steps are for messages that must be older or newer than others.
 SEQ_STEP = 10
@@ -116,8 +116,8 @@ class Timing(Part):
     """Clock of the robot, in its hello."""
 
     lockstep: bool
-    frame_hz: Annotated[float, Field(ge=5.0, le=1000.0)]
-    ttl_s: Positive
+    frame_hz: FrameRate
+    ttl_s: TimeToLive
 
     @property
     def frame_s(self) -> float:
@@ -128,16 +128,15 @@ class Timing(Part):
 class Body(Part):
     """Sizes of the robot that the checks need. With impossible sizes no check that moves the wheels runs."""
 
-    wheel_radius_m: Annotated[float, Field(ge=0.005, le=0.2)]
-    wheel_base_m: Annotated[float, Field(ge=0.03, le=1.0)]
+    wheel_radius_m: WheelRadius
+    wheel_base_m: WheelBase
     max_wheel_rad_s: Positive
     fan_floor: float
 
     @model_validator(mode="after")
     def _check_speed(self) -> Self:
-        speed_m_s = self.wheel_radius_m * self.max_wheel_rad_s
-        if speed_m_s > TOP_SPEED_M_S:
-            raise ValueError(f"a top speed of {speed_m_s:.3g} m/s, at most {TOP_SPEED_M_S:g}")
+        if problem := top_speed_problem(self.wheel_radius_m, self.max_wheel_rad_s):
+            raise ValueError(problem)
         return self
 
 

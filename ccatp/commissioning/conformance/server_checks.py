@@ -50,7 +50,6 @@ FRAMES = 40  # each answered by a drive and a permit
 MOST_HZ = {"imu": 100.0, "enc": 1000.0, "edge": 1000.0}
 PERIOD_TOLERANCE = 0.2
 RATE_TOLERANCE = 1.1
-LONGEST_TTL_S = 0.5  # the limits of the fault table rest on 0.25 s
 CLOCK_S, CLOCK_TOLERANCE = 2.0, 0.03  # 1 % of the clock, and the jitter of the frames
 ATTEMPTS = 5  # a busy machine can look like a fault
 OLDEST_S = 0.15  # robot.sensors_timeout_s
@@ -70,7 +69,6 @@ Frames = Sequence[Message]
 
 
 class _HelloPart(Timing):
-    ttl_s: Annotated[float, Field(gt=0.0, le=LONGEST_TTL_S)]
     protocol: str
     boot: int
     nonce: Annotated[str, Field(pattern=r"^[0-9a-fA-F]{32}$")]

@@ -79,7 +79,6 @@ def hello(config: Config, **changes: Any) -> Hello:
         ("fyst-m1", {"wheel_radius_m": 0.0303}, ""),  # calibrated here
         ("fyst-m1", {"wheel_radius_m": 0.04}, r"wheel_radius_m is 0\.03 here and 0\.04 there"),
         ("fyst-m1", {"wheel_base_m": 0.2}, r"wheel_base_m is 0\.15 here and 0\.2 there"),
-        ("fyst-m1", {"max_wheel_rad_s": 34.0}, r"the top speed there is 1\.02 m/s, more than 1"),
         ("fyst-m1", {"edge_sensors_m": ((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.1, -0.09))}, "edge sensor is"),
         ("fyst-m1", {"puck_m": (0.0, 0.02, 0.05)}, "the puck is at"),
         ("fyst-m2", {"fan_floor": 0.6}, ""),

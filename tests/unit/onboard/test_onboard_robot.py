@@ -308,14 +308,21 @@ def test_the_shipped_configuration_holds_and_names_what_is_not_verified() -> Non
         assert re.search(rf"^{key} = .*UNVERIFIED", devices, re.MULTILINE), key
 
 
+def test_a_time_to_live_of_less_than_two_frames_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"link\.ttl_s must last for two frames at least"):
+        load_onboard_config(overrides={"link.frame_hz": 30.0, "link.ttl_s": 0.05})
+
+
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [
-        ("robot.wheel_radius_m", 0.3, "robot.wheel_radius_m must be between 0.005 and 0.2"),
-        ("robot.wheel_base_m", 0.01, "robot.wheel_base_m must be between 0.03 and 1"),
-        ("robot.max_wheel_rad_s", 40.0, "robot.max_wheel_rad_s = 40 is 1.2 m/s; the link allows 1"),
+        ("robot.wheel_radius_m", 0.3, "robot.wheel_radius_m = 0.3 must be less than or equal to 0.2"),
+        ("robot.wheel_base_m", 0.01, "robot.wheel_base_m = 0.01 must be greater than or equal to 0.03"),
+        ("robot.max_wheel_rad_s", 40.0, "robot.max_wheel_rad_s = 40 is 1.2 m/s; the robot link allows 0.02 to 1"),
+        ("robot.max_wheel_rad_s", 0.5, "robot.max_wheel_rad_s = 0.5 is 0.015 m/s; the robot link allows 0.02 to 1"),
         ("robot.edge_sensors_m", [[0.09, -0.08], [0.09, 0.08], [-0.09, 0.08], [-0.09, -0.08]], "is not front-left"),
-        ("link.ttl_s", 0.015, "link.ttl_s must last for two frames at least"),
+        ("link.ttl_s", 0.015, "link.ttl_s = 0.015 must be greater than or equal to 0.05"),
+        ("link.frame_hz", 10.0, "link.frame_hz = 10.0 must be greater than or equal to 20"),
         ("servo.loop_hz", 120.0, "devices.timer.timeout_s = 0.03 brakes a loop with steps of 0.00833333 s"),
         ("servo.max_v", 24.0, "servo.max_v = 24 is more than devices.motors.supply_v = 12"),
         ("servo.static_v", 12.0, "servo.static_v must be below servo.max_v"),

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import Config
+from ccatp.config.robot_limits import FRAME_HZ
 from ccatp.core import DeckPose, PanelId
-from ccatp.links.robot_codec import decode_from_robot
+from ccatp.links.robot_codec import MAX_LINE_BYTES, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim import ground_truth
@@ -170,18 +171,16 @@ def with_rates(config: Config, **rates: float) -> Config:
     return config.model_copy(update={"sim": config.sim.model_copy(update={"robot": robot})})
 
 
-@pytest.mark.parametrize(
-    ("rates", "why"),
-    [
-        ({"frame_hz": 3.0}, r"a frame of 0.333333 s outlasts ttl_s 0.25"),
-        ({"frame_hz": 5.0}, r"frames at 5 Hz take up to \d+ bytes, a line holds 8192"),
-    ],
-)
-def test_rates_that_do_not_fit_the_link_are_refused(
-    config: Config, mirror: Mirror, rates: dict[str, float], why: str
-) -> None:
-    with pytest.raises(ValueError, match=why):
-        boot(with_rates(config, **rates), mirror)
+def test_the_longest_frame_within_the_limits_fits_a_line(config: Config, mirror: Mirror) -> None:
+    rates = {"frame_hz": FRAME_HZ.low, "encoder_hz": 1000.0, "edge_hz": 1000.0, "imu_hz": 100.0, "gravity_hz": 100.0}
+    world = config.world.model_copy(update={"encoder_counts_per_rev": 4096})  # counted rates have all their digits
+    robot = boot(with_rates(config.model_copy(update={"world": world}), **rates), mirror)
+    lines = []
+    for number in range(1, 20):
+        robot.drive(number, 7.1234567, 7.7654321)
+        robot.advance()
+        lines.append(robot.delivered_line)
+    assert 3000 < max(map(len, lines)) <= MAX_LINE_BYTES
 
 
 # -- what the truth gives away ----------------------------------------------------------------------------------------
