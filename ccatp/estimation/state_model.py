@@ -70,7 +70,6 @@ class SurveyMotion:
     def __init__(self, wheel_radius_m: float, wheel_base_m: float) -> None:
         self._radius_m, self._half_base_m = wheel_radius_m, 0.5 * wheel_base_m
         self._x, self._F = np.zeros(STATES), np.eye(STATES)
-        self._flat = self._F.reshape(-1)
 
     def over(self, dt_s: float, slope: Slope, creep_share: float = 1.0) -> "SurveyMotion":
         """Set the duration of the step, the slope of the ground, and ``share``."""
@@ -109,7 +108,7 @@ class SurveyMotion:
         x_psi, y_psi, x_c, y_c, x_ct, y_ct = d * lx, d * ly, way * gx, way * gy, angle * gx, angle * gy
         xw, yw = 0.5 * dt * x_psi + turn_down * gx, 0.5 * dt * y_psi + turn_down * gy
         psi_v, turn_dt = -k1 * xv - k2 * yv, dt * (1.0 + kl) * half
-        self._flat[_ENTRIES] = (
+        self._F.reshape(-1)[_ENTRIES] = (
             *(x_psi, xv, dt * xv, xw, x_c, x_ct),
             *(y_psi, yv, dt * yv, yw, y_c, y_ct),
             *(1.0 - k1 * x_psi - k2 * y_psi, psi_v, dt * psi_v),
