@@ -168,6 +168,8 @@ class SurveyFrames(ABC):
             acted = self.sent.acted(frame.dt_s, echo.seq, echo.age, echo.permit_age, echo.held)
             set_points = None if is_odometry_off else acted
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity, set_points)
+        if localizer.coasted is not None:  # a replay does not know the drives
+            self._publish_treatment(sensors, "coasted", localizer.coasted)
         if localizer.hold_cause:
             # A filter that diverged is frozen until the next fix.
             mission.handle(EstimateDiverged(localizer.hold_cause, frame.t_s))

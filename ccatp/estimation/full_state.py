@@ -6,7 +6,6 @@ from math import atan2, cos, hypot, inf, sin, sqrt
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.control.wheel_motion import SetPoints
 from ccatp.core import DeckPose, Fix, FloatArray, PanelPose, wrap_pi
 from ccatp.estimation.fixes import FixGated
 from ccatp.estimation.localizer_base import (
@@ -26,7 +25,7 @@ from ccatp.estimation.odometry import PosePredictor, Preintegrator, WheelAngle
 from ccatp.estimation.rest import NoiseFloor, ZeroVelocityDetector
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import STATES, V, W
-from ccatp.estimation.wheel_coast import CoastedMotion, WheelCoast
+from ccatp.estimation.wheel_coast import CoastedMotion, WheelInput
 from ccatp.filters.base import FilterDiverged, Innovation
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
@@ -55,7 +54,6 @@ class FullStateLocalizer(LocalizerBase):
         self._rest_rate_rad_s = self._full.rest_rate_rad_s
         self._update_period_s = self._full.update_period_s - _ROUNDING_S
         self._right, self._left = WheelAngle(), WheelAngle()
-        self._coast = WheelCoast(robot.wheel_lag_s)
         self._gyro = NoiseFloor(cfg.localizer.gyroscope_sigma_rad_s**2)
         self._accelerometer = NoiseFloor(cfg.localizer.accelerometer_sigma_m_s2**2)
         self._rest = ZeroVelocityDetector(self._full.rest_after_s, self._gyro, self._accelerometer)
@@ -114,7 +112,7 @@ class FullStateLocalizer(LocalizerBase):
         left: WheelReadings,
         edges: Edges,
         gravity: Gravity,
-        set_points: SetPoints | None,
+        set_points: WheelInput,
     ) -> None:
         coasted = None
         if not (right[0] and left[0]) or self._coast.gap_s:
@@ -159,9 +157,7 @@ class FullStateLocalizer(LocalizerBase):
             self._end_block(transitions, coasted, is_stop=is_stop)
         self._locate()
 
-    def _stand(
-        self, dt_s: float, imu: ImuReadings, edges: Edges, gravity: Gravity, set_points: SetPoints | None
-    ) -> None:
+    def _stand(self, dt_s: float, imu: ImuReadings, edges: Edges, gravity: Gravity, set_points: WheelInput) -> None:
         """Take a frame at rest."""
         self._rebase()  # at rest the sums contain only noise
         if set_points is not None and set_points[0] == set_points[1] == 0.0:
@@ -178,7 +174,7 @@ class FullStateLocalizer(LocalizerBase):
         self, transitions: Sequence[SensorTransition], coasted: CoastedMotion | None, *, is_stop: bool
     ) -> None:
         if coasted is None:
-            self._coast.learn(*self._running.wheel_rates())
+            self._coast.learn(self._block.dt_s, *self._running.wheel_rates())
         self._take_block(self.t_s, coasted)
         for transition in transitions:
             self._estimate.cross(transition, self.t_s)
@@ -190,7 +186,7 @@ class FullStateLocalizer(LocalizerBase):
     # -- frames without encoder samples -------------------------------------------------------------------------------
 
     def _coasted(
-        self, dt_s: float, right: WheelReadings, left: WheelReadings, set_points: SetPoints | None
+        self, dt_s: float, right: WheelReadings, left: WheelReadings, set_points: WheelInput
     ) -> tuple[WheelReadings, WheelReadings, CoastedMotion | None]:
         """The samples to use of a frame in a gap, at its end, or of slow encoders; the predicted motion in a gap."""
         coast, since_s, is_resting = self._coast, self.t_s - dt_s, self._rest.is_resting
@@ -206,15 +202,14 @@ class FullStateLocalizer(LocalizerBase):
                     self._predict_pose(self._half_s)
                 variance_rad2 = max(wheel.variance_rad2() for wheel in wheels)
                 coast.begin(*self._running.wheel_rates(), variance_rad2, is_resting=is_resting)
-            coasted = coast.advance(dt_s, set_points, is_right=is_right, is_left=is_left)
+            self.coasted = coasted = coast.advance(dt_s, set_points, is_right=is_right, is_left=is_left)
             self.gap_s += dt_s
             if coast.gap_s > _TRUSTED_GAP_S and coast.has_moved:
                 self._estimate.distrust_leg()
-        rates = coast.rates()
         if self._right.is_coasting and right[0]:
-            right = self._right.end_coasting(since_s, rates[0], *right)
+            right = self._right.end_coasting(since_s, coast.rates[0], *right)
         if self._left.is_coasting and left[0]:
-            left = self._left.end_coasting(since_s, rates[1], *left)
+            left = self._left.end_coasting(since_s, coast.rates[1], *left)
         if coasted is None and coast.gap_s:
             coast.end()
         if self._right.has_lost or self._left.has_lost:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ccatp.conditions import FILTER_DIVERGED, FRAMES_BACKWARD, SENSOR_BACKWARD
 from ccatp.config.models import Config
-from ccatp.control.wheel_motion import ImuGate, SetPoints, WheelMeans, largest_rate_rad_s
+from ccatp.control.wheel_motion import ImuGate, WheelMeans, largest_rate_rad_s
 from ccatp.core import (
     EdgeSample,
     Fix,
@@ -20,6 +20,7 @@ from ccatp.core import (
     WheelSample,
 )
 from ccatp.estimation.fixes import DeckFoot, check_fix, deck_foot
+from ccatp.estimation.wheel_coast import CoastedMotion, WheelCoast, WheelInput
 from ccatp.filters import FILTERS
 from ccatp.filters.base import Filter, FilterDiverged
 from ccatp.mirror.mirror import Mirror
@@ -38,6 +39,7 @@ LONGEST_GAP_S = 0.4
 BACKWARD_LIMIT = 5
 """Number of backward time stamps in a row that requests a hold."""
 _ROUNDING_S = 1e-3  # interface control document 1: a sample may be later than its frame by the rounding of both times
+_LONGEST_INTERVAL_S = 0.05  # of two edge samples around a transition; later the place of the sensor in between is open
 _READABLE = 1e9  # rad/s or m/s^2: far beyond every sensor's range; its squares and products stay finite
 
 
@@ -164,7 +166,10 @@ class SensorTransition(NamedTuple):
 
 
 class EdgeScanner:
-    """Finds the transitions in the stream of edge samples. Samples not newer than the last one are skipped."""
+    """Finds the transitions in the stream of edge samples. Samples not newer than the last one are skipped.
+
+    A transition in a gap of the samples is none: where the sensor was at that moment is not known.
+    """
 
     def __init__(self) -> None:
         self.restart()
@@ -184,7 +189,7 @@ class EdgeScanner:
                 continue
             if sample[1:] != values:
                 for corner, (old, new) in enumerate(zip(values, sample[1:], strict=bool(values))):
-                    if old != new:
+                    if old != new and t - last <= _LONGEST_INTERVAL_S:
                         found.append(SensorTransition(0.5 * (last + t), t - last, corner, bool(new)))
                 values = sample[1:]
             last = t
@@ -212,12 +217,14 @@ class LocalizerBase(ABC):
     diverged, and the pose is constant until the next fix. ``notices``: for the operator, cleared by their reader.
     Refused are samples older than ``localizer.history_s``, inertial samples that contradict the wheels, and impossible
     wheel rates. ``gap_s``: time without encoder samples since the last fix that was used, s; then the odometry is
-    predicted from the drives (``wheel_coast``).
+    predicted from the drives. ``coasted``: the motion that was predicted for the newest frame, ``None`` without a gap.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, states: int, wrap: FilterWrap) -> None:
         self.t_s, self.hold_cause, self.is_frozen = -inf, "", False
         self.gap_s = 0.0
+        self.coasted: CoastedMotion | None = None
+        self._coast = WheelCoast(cfg.robot.wheel_lag_s)
         self.counts: dict[str, int] = Counter()
         self.notices: list[str] = []
         # Subclasses re-initialise the filter at once; only its size matters here.
@@ -247,11 +254,12 @@ class LocalizerBase(ABC):
         encoders: Sequence[WheelSample],
         edges: Edges,
         gravity: Gravity = None,
-        set_points: SetPoints | None = None,
+        set_points: WheelInput = None,
     ) -> None:
         """Take one sensors frame at robot time ``t_s``: any number of samples of each kind, oldest first.
 
-        ``set_points``: those of the wheels since the last frame, ``None``: unknown. Unusable samples are dropped and
+        ``set_points``: those of the wheels since the last frame, ``None``: unknown; in a replay ``coasted`` of this
+        frame, if there was one. Unusable samples are dropped and
         counted. A frame that is not newer than the last one has no effect.
         """
         last_s = self.t_s
@@ -278,6 +286,7 @@ class LocalizerBase(ABC):
         if intake.backward_source:
             self._request_hold(SENSOR_BACKWARD.text(sensor=intake.backward_source))
             intake.backward_source = ""
+        self.coasted = None
         try:
             self._use(dt_s, imu, right, left, edges, gravity, set_points)
         except FilterDiverged as error:
@@ -330,6 +339,6 @@ class LocalizerBase(ABC):
         left: WheelReadings,
         edges: Edges,
         gravity: Gravity,
-        set_points: SetPoints | None,
+        set_points: WheelInput,
     ) -> None:
         """Advance the filter, unless frozen, by ``dt_s`` (0 in a new time base); may raise ``FilterDiverged``."""

@@ -7,15 +7,16 @@ from math import hypot, inf, sqrt
 import numpy as np
 
 from ccatp.config.models import Config, LocalizerConfig, RobotConfig
-from ccatp.control.wheel_motion import SetPoints
 from ccatp.core import (
     DeckPose,
     Fix,
     FloatArray,
     PanelId,
     PanelPose,
+    Twist,
     difference,
     rotate,
+    wheel_rates,
     wrap_pi,
 )
 from ccatp.estimation.localizer_base import (
@@ -31,6 +32,7 @@ from ccatp.estimation.localizer_base import (
 )
 from ccatp.estimation.odometry import Odometer, arc_step
 from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate
+from ccatp.estimation.wheel_coast import WheelInput
 from ccatp.filters.base import FilterDiverged, Innovation
 from ccatp.mirror.mirror import Mirror
 
@@ -123,6 +125,8 @@ class ConstantAcceleration:
         return F, Q
 
 
+_LOST = 1.5  # number of pauses between two frames with samples beyond which samples are missing
+_STILL_RAD_S = 0.02  # a slower wheel stands
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
 _SELECT_HEADING = np.eye(STATES)[THETA : THETA + 1]
 
@@ -187,6 +191,8 @@ class FourStateLocalizer(LocalizerBase):
         self._gate = HeadingGate(cfg.crossing_gate_sigma)
         self._sigma = PositionSigma(cfg.start_position_sigma_m, cfg.slip_fraction)
         self._deck: DeckPose | None = None
+        self._radius_m, self._base_m = config.robot.wheel_radius_m, config.robot.wheel_base_m
+        self._wheels_s, self._pause_s = -inf, inf  # last frame with samples of both wheels, shortest time between two
         self._x_m, self._y_m = start.x_m, start.y_m
         self._enter(start.panel)
         self._reset_at_rest(start.heading_rad, cfg.start_heading_sigma_rad**2)
@@ -236,14 +242,51 @@ class FourStateLocalizer(LocalizerBase):
         left: WheelReadings,
         edges: Edges,
         gravity: Gravity,
-        set_points: SetPoints | None,
+        set_points: WheelInput,
     ) -> None:
         if self.is_frozen:
+            return
+        if right[0] and left[0]:
+            self._follow(dt_s, set_points)
+        elif dt_s > 0.0 and self.t_s - self._wheels_s > _LOST * self._pause_s:
+            self._coast_on(dt_s, imu, set_points)
             return
         self._advance(dt_s, self._builder.stack(self.t_s, imu, right, left))
         transitions = self._crossings.scan(self.t_s, self.speed_m_s, self.rate_rad_s, edges)
         if transitions:
             self._use_crossings(transitions)
+
+    def _wheel_rates(self) -> tuple[float, float]:
+        return wheel_rates(Twist(self.speed_m_s, self.rate_rad_s), self._radius_m, self._base_m)
+
+    def _follow(self, dt_s: float, set_points: WheelInput) -> None:
+        """Take what the wheels turned in a frame with samples of both."""
+        coast, means = self._coast, self._wheel_means
+        if coast.gap_s:
+            coast.end()
+        if self._wheels_s > -inf:
+            self._pause_s = min(self._pause_s, max(self.t_s - self._wheels_s, dt_s))
+        self._wheels_s = self.t_s
+        coast.follow(dt_s, set_points, dt_s * (means.right_rad_s or 0.0), dt_s * (means.left_rad_s or 0.0))
+        coast.learn(dt_s, *self._wheel_rates())
+
+    def _coast_on(self, dt_s: float, imu: ImuReadings, set_points: WheelInput) -> None:
+        """Take a frame in a gap of the encoders: the predicted turns are a measurement of both rates."""
+        coast = self._coast
+        if not coast.gap_s:
+            rates = self._wheel_rates()
+            is_resting = max(map(abs, rates)) < _STILL_RAD_S
+            coast.begin(*rates, (self._cfg.encoder_sigma_rad_s * self._pause_s) ** 2, is_resting=is_resting)
+        self.coasted = now = coast.advance(dt_s, set_points)
+        self.gap_s += dt_s
+        times = (self.t_s,)
+        z, H, R = self._builder.stack(self.t_s, imu, (times, (now.right_rad / dt_s,)), (times, (now.left_rad / dt_s,)))
+        R = R.copy()
+        R[0] += now.right_rad2 / dt_s**2
+        R[1] += now.left_rad2 / dt_s**2
+        self._advance(dt_s, (z, H, R))
+        along_rad2 = now.right_rad2 + now.left_rad2 + 2.0 * now.both_rad2
+        self._sigma.widen(0.5 * self._radius_m * sqrt(max(along_rad2, 0.0)))
 
     def reset_filter(self, mu: FloatArray, sigma: FloatArray) -> None:
         """Re-initialise the state (v, a, theta, omega), theta in the panel frame; thesis: ``resetFilter(mu, Sigma)``.
@@ -262,6 +305,7 @@ class FourStateLocalizer(LocalizerBase):
         Their rows and columns of the covariance are reset, too. The thesis resets only the diagonal, which leaves wrong
         correlations. Call it at standstill; while the wheels run down it makes the filter overconfident.
         """
+        self._coast.stand()
         if not self.is_frozen:
             mean, covariance = self._filter.mean, self._filter.covariance
             self._reset_at_rest(float(mean[THETA]), float(covariance[THETA, THETA]))
@@ -293,6 +337,7 @@ class FourStateLocalizer(LocalizerBase):
         self._x_m, self._y_m = self._x_m + gain * ex, self._y_m + gain * ey
         self._deck = None
         self.counts["fixes"] += 1
+        self.gap_s = self._coast.gap_s
         self._hand_over()
         return gain * hypot(ex, ey)
 
@@ -374,6 +419,7 @@ class FourStateLocalizer(LocalizerBase):
         if last_s == -inf:
             return
         self._crossings.restart()
+        self._wheels_s = -inf
         self._sigma.widen(abs(self.speed_m_s) * MAX_FRAME_STEP_S)
         if not self.is_frozen:
             self._filter.predict(np.eye(STATES), self._process.over(MAX_FRAME_STEP_S)[1])

@@ -9,6 +9,9 @@ What is not known, as the covariance of both angles' errors since the begin of t
 
 * the follow error at its begin (dead time of the control loop, readings of the angles): it appears with the share
   1 - exp(-t/T);
+* the load of a wheel (slope, friction): a real servo follows its set point only to a share of the travel, which is
+  learned from d - T w since the last rest; within the gap the rate is wrong by twice this share, and the servo may
+  correct what it owes or not;
 * T: its learned standard deviation, times the change of the follow error with T;
 * the moment at which a robot held its wheels by a rule of its own, see ``SetPoints``;
 * the set points, where they are not known: anything from the recent rate on to an immediate stop.
@@ -19,16 +22,19 @@ from typing import NamedTuple
 
 from ccatp.control.wheel_motion import SetPoints
 
-# A drive acts in the next step of the control loop, which has 500 Hz or more.
-_DEAD_TIME_S = 0.001
+# A drive acts in the next step of the control loop, which has 500 Hz or more: uniform over 2 ms.
+_DEAD_TIME_S = 0.0006
 _STILL_RAD = 1e-4  # a wheel that turns less in a frame stands: 3 um
 # Standard deviation of a lag that was never measured: the worlds draw it uniformly from 20 % to both sides.
 _LAG_SPREAD = 0.2 / sqrt(3.0)
 # A lag is never known better than to this part: servo and load are not exactly of first order.
-_LEAST_LAG_SPREAD = 0.01
+_LEAST_LAG_SPREAD = 0.005
 _RATE_SIGMA_RAD_S = 0.05  # of the rate by which the follow error is divided: two counts in 40 ms, smoothed
+# Share of its travel by which a servo under load is off: before any leg, the least, and the travel that shows it.
+_LOAD_SHARE, _LEAST_LOAD_SHARE, _LOADED_RAD = 0.02, 2e-4, 1.0
+_LOAD_MEMORY_S = 3.0  # of motion, over which the share is averaged: some legs
 _FAST_RAD_S = 0.5  # a slower wheel shows nothing of its lag
-_SAMPLES = 25.0  # a servo's deviations from first order are the same over about a second: 25 steps of the filter
+_ALIKE_S = 1.0  # for about so long a servo deviates from first order in the same way
 # After this time without a drive the robot stands: time-to-live of the last drive, and run-down of the wheels.
 _STANDS_AFTER_S = 0.4
 
@@ -43,10 +49,15 @@ class CoastedMotion(NamedTuple):
     both_rad2: float  # covariance of right and left
 
 
+WheelInput = SetPoints | CoastedMotion | None
+"""What a localizer is told about the wheels besides samples: set points, or in a replay the motion predicted then."""
+
+
 class WheelCoast:
     """Follows the set points of both wheels, and predicts the wheels without samples.
 
-    ``gap_s``: length of the present gap, 0 while there are samples; ``has_moved``: the wheels turned in it.
+    ``gap_s``: length of the present gap, 0 while there are samples; ``has_moved``: the wheels turned in it; ``rates``:
+    mean rates of the wheels in its last frame, rad/s.
     """
 
     def __init__(self, wheel_lag_s: float) -> None:
@@ -55,58 +66,77 @@ class WheelCoast:
         self._spread2 = (_LAG_SPREAD * wheel_lag_s) ** 2
         self._least2 = (_LEAST_LAG_SPREAD * wheel_lag_s) ** 2
         self._follows = [0.0, 0.0]  # follow errors of the right and the left wheel, rad
+        self._travels = [0.0, 0.0]  # of the set points since the last rest, rad
+        self._share2 = _LOAD_SHARE**2
         self._is_known = self.has_moved = True  # the follow errors are measured
         self.begin(0.0, 0.0, 0.0, is_resting=True)
 
     def stand(self) -> None:
         """The wheels stand, and their set points are zero."""
-        self._follows = [0.0, 0.0]
+        self._follows, self._travels = [0.0, 0.0], [0.0, 0.0]
         self._is_known = True
 
-    def follow(self, dt_s: float, set_points: SetPoints | None, right_rad: float, left_rad: float) -> None:
+    def follow(self, dt_s: float, set_points: WheelInput, right_rad: float, left_rad: float) -> None:
         """Take a frame with samples: the set points of the wheels, and what they turned."""
         if set_points is None or set_points[2] or set_points[3]:
             self._is_known = False
             return
-        follows = self._follows
+        follows, travels = self._follows, self._travels
+        travels[0] += abs(set_points[0]) * dt_s
+        travels[1] += abs(set_points[1]) * dt_s
         follows[0] += set_points[0] * dt_s - right_rad
         follows[1] += set_points[1] * dt_s - left_rad
 
-    def learn(self, right_rad_s: float, left_rad_s: float) -> None:
-        """Learn the lag from the present rates of the wheels."""
-        if not self._is_known:
+    def learn(self, dt_s: float, right_rad_s: float, left_rad_s: float) -> None:
+        """Learn the lag from the rates of the wheels, ``dt_s`` after the last call."""
+        if not self._is_known or dt_s <= 0.0:
             return
-        for follow, rate in zip(self._follows, (right_rad_s, left_rad_s), strict=True):
+        of_rate = (self._lag_s * _RATE_SIGMA_RAD_S) ** 2
+        for follow, rate, travel in zip(self._follows, (right_rad_s, left_rad_s), self._travels, strict=True):
             if -_FAST_RAD_S < rate < _FAST_RAD_S:
                 continue
-            noise = _SAMPLES * ((_DEAD_TIME_S * rate) ** 2 + (self._lag_s * _RATE_SIGMA_RAD_S) ** 2)
+            owed = follow - self._lag_s * rate
+            if travel > _LOADED_RAD:
+                seen2 = (owed * owed - of_rate - self._spread2 * rate * rate) / (travel * travel)
+                self._share2 += dt_s / _LOAD_MEMORY_S * (seen2 - self._share2)
+                self._share2 = max(self._share2, _LEAST_LOAD_SHARE**2)
+            noise = _ALIKE_S / dt_s * ((_DEAD_TIME_S * rate) ** 2 + of_rate + self._share2 * travel * travel)
             gain = self._spread2 * rate / (self._spread2 * rate * rate + noise)
-            self._lag_s = max(self._lag_s + gain * (follow - self._lag_s * rate), 1e-3)
+            self._lag_s = max(self._lag_s + gain * owed, 1e-3)
             self._spread2 = max((1.0 - gain * rate) * self._spread2, self._least2)
 
     def begin(self, right_rad_s: float, left_rad_s: float, reading_rad2: float, *, is_resting: bool) -> None:
         """Begin a gap at these rates of the wheels; ``reading_rad2``: variance of an angle's reading."""
         self._first2, self._by_lag, self._largest, self._shown2 = [0.0, 0.0], (0.0, 0.0), 0.0, [0.0, 0.0]
+        self._coasted = [0.0, 0.0]
         self._kept, self._free = 1.0, (right_rad_s, left_rad_s)
+        self.rates = right_rad_s, left_rad_s
         self.has_moved = False
         if is_resting:
             return
         lag_s, first2, follows = self._lag_s, self._first2, self._follows
         for k, rate in enumerate(self._free):
             # Two estimates of the follow error: the measured one, and lag times rate.
-            own = (_DEAD_TIME_S * rate) ** 2 + 2.0 * reading_rad2
+            owed2 = self._share2 * self._travels[k] ** 2
+            own = (_DEAD_TIME_S * rate) ** 2 + 2.0 * reading_rad2 + owed2
             of_rate = self._spread2 * rate * rate + (lag_s * _RATE_SIGMA_RAD_S) ** 2
             share = own / (own + of_rate) if self._is_known else 1.0
             follows[k] += share * (lag_s * rate - follows[k])
-            first2[k] = (1.0 - share) * own if self._is_known else of_rate
+            first2[k] = (1.0 - share) * own + owed2 if self._is_known else of_rate + owed2
 
     def advance(
-        self, dt_s: float, set_points: SetPoints | None, *, is_right: bool = True, is_left: bool = True
+        self, dt_s: float, set_points: WheelInput, *, is_right: bool = True, is_left: bool = True
     ) -> CoastedMotion:
         """Take a frame in which the right, the left, or both wheels have no samples."""
         before_s, self.gap_s = self.gap_s, self.gap_s + dt_s
-        found = self._advance_unknown(before_s) if set_points is None else self._advance(dt_s, set_points)
+        if isinstance(set_points, CoastedMotion):
+            found = set_points
+        elif set_points is None:
+            found = self._advance_unknown(before_s)
+        else:
+            found = self._advance(dt_s, set_points)
         right_rad, left_rad, right_rad2, left_rad2, both_rad2 = found
+        self.rates = right_rad / dt_s, left_rad / dt_s
         self.has_moved = self.has_moved or abs(right_rad) + abs(left_rad) > _STILL_RAD
         if not (is_right and is_left):
             right_rad2, left_rad2, both_rad2 = is_right * right_rad2, is_left * left_rad2, 0.0
@@ -129,6 +159,12 @@ class WheelCoast:
         self._kept *= keep
         shown = (1.0 - self._kept) ** 2
         first_right, first_left = shown * self._first2[0], shown * self._first2[1]
+        # A wrong rate is wrong in the whole gap, so that its error grows with the travel and not with its root.
+        coasted = self._coasted
+        coasted[0] += abs(turns[0])
+        coasted[1] += abs(turns[1])
+        first_right += 4.0 * self._share2 * coasted[0] ** 2
+        first_left += 4.0 * self._share2 * coasted[1] ** 2
         before_right, before_left = self._shown2
         self._shown2 = [first_right, first_left]
         stop_right, stop_left = set_points[2:]
@@ -151,11 +187,6 @@ class WheelCoast:
             *(way_s * right, way_s * left),
             *(spread_s2 * right * right, spread_s2 * left * left, spread_s2 * right * left),
         )
-
-    def rates(self) -> tuple[float, float]:
-        """Predicted rates of the wheels, rad/s."""
-        right, left = self._follows
-        return right / self._lag_s, left / self._lag_s
 
     def end(self) -> None:
         """Samples come again; until the next rest the follow errors are those of the prediction."""

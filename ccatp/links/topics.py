@@ -175,16 +175,17 @@ class Rest(Message):
     """For the mission the robot is at rest from frame ``seq`` on."""
 
 
-TreatmentKind = Literal["begun", "doubted", "odometry_off", "odometry_on"]
+TreatmentKind = Literal["begun", "coasted", "doubted", "odometry_off", "odometry_on"]
 
 
 class Treatment(Message):
     """An input of the localizer besides samples and fixes, from frame ``seq`` on.
 
     ``begun``: it starts again before this frame; values: x (m), y (m), heading (rad), deck frame, and the standard
-    deviations of position (m) and heading (rad). ``doubted``: after the samples of this frame its covariance is
-    inflated; values: standard deviations, m and rad. ``odometry_off``: wheels and inertial unit are not used, the robot
-    stands; ``odometry_on``: they are used again.
+    deviations of position (m) and heading (rad). ``coasted``: encoders are silent; values: predicted turns of the right
+    and the left wheel in this frame, rad, growth of their variances and of their covariance, rad^2. ``doubted``: after
+    the samples of this frame its covariance is inflated; values: standard deviations, m and rad. ``odometry_off``:
+    wheels and inertial unit are not used, the robot stands; ``odometry_on``: they are used again.
     """
 
     kind: TreatmentKind

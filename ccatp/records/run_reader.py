@@ -36,6 +36,7 @@ class Marked(NamedTuple):
     begun: tuple[float, ...] | None = None  # before the frame it was reset, with these values of ``Treatment``
     is_odometry_off: bool = False  # the robot stands; wheels and inertial unit are not used
     doubted: tuple[float, ...] | None = None  # after the samples its uncertainty was increased by this, m and rad
+    coasted: tuple[float, ...] | None = None  # predicted motion of the wheels, in place of samples
 
 
 class Fixed(NamedTuple):
@@ -80,7 +81,8 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
             begun = treatments.pop((last, "begun"), None)
             if (last, "odometry_off") in treatments or (last, "odometry_on") in treatments or begun is not None:
                 is_odometry_off = (last, "odometry_off") in treatments
-            yield Marked(message, last in rests, begun, is_odometry_off, treatments.pop((last, "doubted"), None))
+            doubted, coasted = treatments.pop((last, "doubted"), None), treatments.pop((last, "coasted"), None)
+            yield Marked(message, last in rests, begun, is_odometry_off, doubted, coasted)
             rests.discard(last)
     while fixes and fixes[0].seq <= last:
         yield _fixed(fixes.popleft())

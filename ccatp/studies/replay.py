@@ -14,6 +14,7 @@ from ccatp.config.models import Config
 from ccatp.control.wheel_motion import as_standing
 from ccatp.core import DeckPose, FloatArray, IntArray
 from ccatp.estimation.fixes import FixRefused
+from ccatp.estimation.wheel_coast import CoastedMotion
 from ccatp.filters.base import Filter, FilterError, FilterModel, Innovation
 from ccatp.filters.metrics import nees, rms
 from ccatp.filters.smoother import ROUNDING, Smoothed, Smoother
@@ -235,7 +236,8 @@ class _Player:
             self._localizer = build_with_uncertainty(self._cfg, self._mirror, pose, (sigmas[0], sigmas[1]), self._wrap)
         localizer, sensors = self._localizer, event.sensors
         imu, enc = ((), as_standing(sensors.enc)) if event.is_odometry_off else (sensors.imu, sensors.enc)
-        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
+        coasted = None if event.coasted is None else CoastedMotion(*event.coasted)
+        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity, coasted)
         if localizer.hold_cause:
             localizer.clear_hold()
         if event.doubted is not None:

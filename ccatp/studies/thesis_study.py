@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.control.wheel_motion import SetPoints
 from ccatp.core import EdgeSample, EventCode, Fix, FloatArray, GravitySample, ImuSample, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.localizer_base import SensorTransition
 from ccatp.estimation.thesis_localizer import THETA, FourStateLocalizer
+from ccatp.estimation.wheel_coast import WheelInput
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.records.summary import WITHIN_M
@@ -92,7 +92,7 @@ class ThesisLocalizer(FourStateLocalizer):
 
     def step(
         self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample], edges: Sequence[EdgeSample],
-        gravity: GravitySample | None = None, set_points: SetPoints | None = None,
+        gravity: GravitySample | None = None, set_points: WheelInput = None,
     ) -> None:  # fmt: skip
         """Process one sensors frame; see ``FourStateLocalizer.step``."""
         k = 1.0 / self.period_factor

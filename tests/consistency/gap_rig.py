@@ -1,8 +1,9 @@
 """Drives with a gap in the samples, without daemon and link: how wrong the estimate is, and how wrong it says it is.
 
-A drive warms up with fixes, as a survey does: it stands, and drives legs and turns. Then comes the drive in which sensors
-are silent. The process forks for each begin of the gap, and again for each set of silent sensors, because a localizer
-cannot be copied. The state within a gap does not depend on when the gap will end, so one drive shows all lengths.
+A drive warms up with fixes, as a survey does: it stands, and drives legs and turns. Then comes the drive in which
+sensors are silent. The process forks for each begin of the gap, and again for each set of silent sensors, because a
+localizer cannot be copied. The state within a gap does not depend on when the gap will end, so one drive shows all
+lengths.
 """
 
 import os
@@ -218,7 +219,7 @@ def _forked(task: Callable[[], Any]) -> Any:
             os._exit(0)
     os.close(writer)
     with os.fdopen(reader, "rb") as pipe:
-        result = pickle.load(pipe)  # noqa: S301 - of the child
+        result = pickle.load(pipe)
     os.waitpid(child, 0)
     return result
 
