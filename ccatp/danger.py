@@ -70,6 +70,11 @@ class DangerMonitor(EmergencyRules):
             self._escalation = SeverityEscalation(self._health)
         self.verdict = self.stale(-1, 0.0)
 
+    def limit_wheels(self, max_wheel_rad_s: float) -> None:
+        """Take the robot's own limit for the wheels' rates, after a reset."""
+        if self._board is not None:
+            self._board.limit_wheels(min(max_wheel_rad_s, self._robot.max_wheel_rad_s))
+
     @property
     def code(self) -> EventCode:
         """The event code now."""

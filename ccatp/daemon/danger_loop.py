@@ -183,12 +183,15 @@ class DangerLoop(RobotLoop):
 
     def on_joined(self, hello: Hello) -> None:
         self._permits.begin_session()
+        self.monitor.limit_wheels(hello.robot.max_wheel_rad_s)
         self.begin_session()
         port = self.robot_cfg.port
         self.log.info("robot_joined", port=port, lockstep=hello.lockstep, session=self.sessions)
 
     def on_restarted(self) -> None:
         self.monitor.reset()
+        if self.hello is not None:
+            self.monitor.limit_wheels(self.hello.robot.max_wheel_rad_s)
         self._estimates.reset()
         self._permits.restart()
         self._seq = -1

@@ -10,6 +10,7 @@ from math import atan2, cos, hypot, inf, isfinite, log, pi, sin, sqrt
 from typing import NamedTuple
 
 from ccatp.conditions import (
+    ENCODERS_STALE,
     NO_FRAME,
     NO_FRESH_ESTIMATE,
     OBSTACLE_AHEAD,
@@ -96,6 +97,7 @@ class BeaconSafetyRules(EmergencyRules):
         """Begin again after a boot of the robot, whose clock has restarted. Emergencies stay latched."""
         super().reset()
         self._radio_s: float | None = None
+        self._wheels_s: float | None = None  # newest encoder sample
         self._levels: deque[tuple[float, float]] = deque()
         avoidance = self._avoidance
         self._echoes = ObstacleBuffer(avoidance.sensors_rad, avoidance.influence_m, self._danger.memory_s)
@@ -106,6 +108,9 @@ class BeaconSafetyRules(EmergencyRules):
         self._state, self._state_seq = "idle", 0
         self._frame_seq = -1
         self.code = _NORMAL
+
+    def limit_wheels(self, _max_wheel_rad_s: float) -> None:
+        """No rule compares wheels with their set points."""
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
@@ -162,6 +167,8 @@ class BeaconSafetyRules(EmergencyRules):
     def _roll(self, sensors: Sensors, extras: BeaconFrame) -> None:
         steering, vehicle = {sample.t_s: sample.steer_rad for sample in extras.steer}, self._vehicle
         for t_s, right, left in possible_samples(sensors.t, sensors.enc):
+            if right is not None and left is not None:
+                self._wheels_s = t_s
             before_s = sensors.t if self._rolled_to_s is None else self._rolled_to_s
             if right is None or left is None or t_s <= before_s:
                 continue
@@ -182,6 +189,9 @@ class BeaconSafetyRules(EmergencyRules):
         newest_s = t_s if self._radio_s is None else self._radio_s
         if t_s - newest_s > danger.radio_timeout_s:
             return RADIO_SILENT.found("radio", t_s - newest_s, danger.radio_timeout_s)
+        silent_s = t_s if self._wheels_s is None else t_s - self._wheels_s
+        if not silent_s <= danger.stale_after_s:
+            return ENCODERS_STALE.found("enc", silent_s, danger.stale_after_s)
         age_s = inf if estimate is None else t_s - estimate.t_s
         if estimate is None or not age_s <= danger.estimate_timeout_s:
             limit_s = danger.estimate_timeout_s

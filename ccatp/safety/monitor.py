@@ -87,6 +87,10 @@ class HealthMonitor:
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
+    def limit_wheels(self, max_wheel_rad_s: float) -> None:
+        """Take the robot's own limit for the wheels' rates, to which it clamps set points."""
+        self._ratio.largest_rad_s = max_wheel_rad_s
+
     def jumped(self, t_s: float, by_s: float) -> None:
         """Report that the robot's clock jumped before the frame at ``t_s``."""
         finding = conditions.CLOCK_JUMPED.found("clock", by_s, self._cfg.clock_jump_s)

@@ -39,6 +39,7 @@ class SpeedRatioMonitor:
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
         self._cfg, self._radius_m, self._lag_s = cfg, robot.wheel_radius_m, robot.wheel_lag_s
         self.alarm = FindingLatch(cfg.retry_after_s)
+        self.largest_rad_s = robot.max_wheel_rad_s  # the robot clamps to this, and keeps the ratio of the wheels
         self.ratios: tuple[float | None, float | None] = (None, None)  # (right, left); None: too little travel
         self._window: deque[_Interval] = deque()
         self.reset()
@@ -67,8 +68,10 @@ class SpeedRatioMonitor:
         """Take the span (rad/s) of the drives up to ``t_s``: lowest and highest, right, then left wheel."""
         before_s, self._t_s = self._t_s, t_s
         right_low, right_high, left_low, left_high = commanded
-        half = 0.5 * self._radius_m
-        set_points = half * (right_low + right_high), half * (left_low + left_high)
+        right, left = 0.5 * (right_low + right_high), 0.5 * (left_low + left_high)
+        fastest = max(abs(right), abs(left), self.largest_rad_s)
+        scale_m = self._radius_m * self.largest_rad_s / fastest
+        set_points = scale_m * right, scale_m * left
         speeds, covered_s, travelled = self._speeds, self._covered_s, (self._right_m, self._left_m)
         self._clear()
         length_s = 0.0 if before_s is None else t_s - before_s

@@ -14,12 +14,14 @@ from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, Pose
 from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.store import BeaconStore, BeaconStoreError
+from ccatp.conditions import ENCODERS_STALE
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import EstimateMessage
 from ccatp.records.beacon_summary import BeaconSummary
 from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
 from ccatp.sim.beacon_robot import BeaconRobot
@@ -400,3 +402,22 @@ def test_a_pose_too_uncertain_holds_until_readings_help() -> None:
     stage = play(BeaconSilWorld(cfg), until_s=10.0)
     assert stage.mission.state.mode == "held"
     assert stage.mission.state.cause == "the position is too uncertain"
+
+
+def test_silent_encoders_hold_a_robot_among_beacons(cfg: RadioConfig) -> None:
+    rules, robot = BeaconSafetyRules(cfg), BeaconRobot(cfg, RadioWorld(cfg))
+    robot.join("controller")
+    limit_s, verdicts = cfg.danger.stale_after_s, []
+    for _ in range(40):
+        robot.advance()
+        sensors, extras = frame_of(robot)
+        if sensors.t > 1.0:
+            sensors = replace(sensors, enc=[])
+        estimate = EstimateMessage(
+            seq=sensors.seq, t_s=sensors.t, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=0.1, state="visiting"
+        )
+        verdicts.append((sensors.t, rules.step(sensors, extras, estimate)))
+    for t_s, verdict in verdicts:
+        assert (verdict.cause == ENCODERS_STALE.message) is (t_s > 1.0 + limit_s + 1e-9), t_s
+    last = verdicts[-1][1]
+    assert (last.forward, last.reverse, last.turn) == (False, False, False)

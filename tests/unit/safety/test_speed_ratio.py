@@ -115,6 +115,16 @@ def test_nothing_is_fitted_across_a_time_in_which_the_set_points_are_not_known()
             assert (monitor.ratios[0] is None) is (k < 60 or 80 <= k < 135), k
 
 
+def test_set_points_that_the_robot_clamps_are_no_wrong_ratio() -> None:
+    monitor = SpeedRatioMonitor(CFG.health, CFG.robot)
+    monitor.largest_rad_s = 4.0
+    for k in range(1, 200):
+        monitor.add(FRAME_S, 4.0, 2.0)
+        if k % 5 == 0:
+            monitor.take(FRAME_S * k, (6.0, 6.0, 3.0, 3.0))
+    assert list(monitor.ratios) == pytest.approx([1.0, 1.0])
+
+
 def test_frames_without_samples_do_not_make_a_wheel_slow() -> None:
     monitor = SpeedRatioMonitor(CFG.health, CFG.robot)
     u = 0.1 / RADIUS_M
