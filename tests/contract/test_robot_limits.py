@@ -90,7 +90,7 @@ async def is_joined(hello: Hello) -> bool:
     return joins == 2
 
 
-@pytest.mark.fault("L24")
+@pytest.mark.fault("L18")
 @pytest.mark.parametrize("among_beacons", [False, True])
 async def test_a_client_joins_a_robot_within_the_limits_and_no_other(among_beacons: bool, measured: Measured) -> None:
     wrong = []
@@ -100,10 +100,10 @@ async def test_a_client_joins_a_robot_within_the_limits_and_no_other(among_beaco
         if await is_joined(hello) is is_beyond:
             wrong.append((name, side, is_beyond))
     assert not wrong
-    measured("L24", 100.0 * (1.0 - len(wrong) / len(CASES)))
+    measured("L18", 100.0 * (1.0 - len(wrong) / len(CASES)))
 
 
-@pytest.mark.fault("L24")
+@pytest.mark.fault("L18")
 @pytest.mark.parametrize(("name", "side", "is_beyond"), CASES)
 def test_the_conformance_suite_has_the_same_limits(name: str, side: str, is_beyond: bool) -> None:
     hello: dict[str, Any] = {"lockstep": False, "frame_hz": 100.0, "ttl_s": 0.25}
@@ -132,7 +132,7 @@ KEYS = {
 }
 
 
-@pytest.mark.fault("L24")
+@pytest.mark.fault("L18")
 @pytest.mark.parametrize("kind", KEYS)
 @pytest.mark.parametrize(("name", "side"), [(name, side) for name in LIMITS for side in ("low", "high")])
 def test_no_configuration_has_a_robot_beyond_the_limits(kind: str, name: str, side: str) -> None:
@@ -148,7 +148,7 @@ def test_no_configuration_has_a_robot_beyond_the_limits(kind: str, name: str, si
         load(kind, overrides)
 
 
-@pytest.mark.fault("L24")
+@pytest.mark.fault("L18")
 async def test_the_refusal_names_the_robot_the_value_and_its_limits() -> None:
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(encode(replace(HELLO, ttl_s=0.001, frame_hz=1.0)))

@@ -301,7 +301,7 @@ at_s = 20.0
 """
 
 
-@pytest.mark.fault("L1", "L11", "L21", "F7", "S14", "S15")
+@pytest.mark.fault("L1", "L11", "L15", "F7", "S14", "S15")
 def test_a_survey_goes_on_through_injected_faults_which_the_log_names(start: Start, tmp_path: Path) -> None:
     (tmp_path / "plan.toml").write_text(FAULTS)
     run = start("--panels", "1", "--faults", str(tmp_path / "plan.toml"))

@@ -44,7 +44,7 @@ steps = st.one_of(
 )
 
 
-@pytest.mark.fault("L22")
+@pytest.mark.fault("L16")
 @given(st.lists(steps, max_size=60))
 def test_every_permit_of_motion_is_that_of_the_frame_that_it_answers(story: list[object]) -> None:
     rule, session, seq = PermitRule(), 1, 0
@@ -110,7 +110,7 @@ def monitor_of(kind: str) -> DangerMonitor | BeaconSafetyRules:
     return build_safety_monitor(config_of() if kind == "survey" else radio_config_of())[0]
 
 
-@pytest.mark.fault("L22")
+@pytest.mark.fault("L16")
 @pytest.mark.parametrize("kind", ["survey", "beacons"])
 @given(order=st.lists(st.integers(0, 12), max_size=20))
 def test_a_monitor_permits_nothing_on_a_frame_that_it_does_not_judge(kind: str, order: list[int]) -> None:

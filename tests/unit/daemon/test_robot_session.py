@@ -110,7 +110,7 @@ def line(seq: int, t_s: float) -> bytes:
     return encode(RobotFrame(seq, t_s, [], [], [], None, (0.5, 0.5), 1.0, echo, ()))
 
 
-@pytest.mark.fault("L21")
+@pytest.mark.fault("L15")
 @pytest.mark.parametrize(
     ("boot", "seq", "t_s", "restarts"),
     [
@@ -146,7 +146,7 @@ async def test_a_restart_shows_in_the_first_frame_of_a_session_also_with_the_sam
         client.leave()
         await asyncio.gather(serving, return_exceptions=True)
     assert client.restarts == restarts
-    measured("L21", max((count - 2 for count in client.restarts), default=0))
+    measured("L15", max((count - 2 for count in client.restarts), default=0))
 
 
 @pytest.mark.fault("L1")
