@@ -36,6 +36,7 @@ def test_the_line_of_the_external_timer_stands_still_once_the_program_is_stopped
 # -- a robot from the interface contracts alone ------------------------------------------------------------------------
 
 OTHER_CLOCK = "--clock-error 0.005 --clock-wander 0.003 --age-s 0.03 --age-jitter-s 0.01"
+RESTARTS = "--restart-at-s 40"
 SLOW_SENSORS = "--lockstep --encoder-hz 250 --edge-hz 500 --lose-samples 0.01"
 CONFIG = """
 robot = {{ port = {robot}, wheel_radius_m = 0.0305, wheel_base_m = 0.147 }}
@@ -45,7 +46,8 @@ dashboard.enabled = false
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [OTHER_CLOCK, SLOW_SENSORS], ids=["real time", "lockstep"])
+@pytest.mark.fault("L15")
+@pytest.mark.parametrize("options", [OTHER_CLOCK, SLOW_SENSORS, RESTARTS], ids=["real time", "lockstep", "restart"])
 def test_a_panel_of_a_foreign_robot_is_surveyed(tmp_path: Path, runtime_dir: Path, options: str) -> None:
     command = [sys.executable, foreign_robot.__file__, "--port", "0", "--laser-port", "0", *options.split()]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as robot:
@@ -60,6 +62,8 @@ def test_a_panel_of_a_foreign_robot_is_surveyed(tmp_path: Path, runtime_dir: Pat
             robot.terminate()
         truth = json.loads(robot.stdout.read())
     assert run.returncode == 0, run.stderr
+    assert run.stderr.count("the robot restarted: relocalizing before it moves") == truth["counts"]["restarts"]
+    assert truth["counts"]["restarts"] == ("restart" in options)
     summary = json.loads(run.stdout)
     assert (summary["reference"], summary["points"]["measured"]) == ("laser", 9)
     assert (truth["points"], truth["falls"], truth["outside_s"], truth["measured_moving"]) == (9, 0, 0.0, 0), truth

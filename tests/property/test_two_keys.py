@@ -20,7 +20,7 @@ from tests.property.two_keys import DIRECTIONS, HZ, TTL, Bounds, Robot, Violatio
 MAIN = Bounds(free=("controller",))
 DANGER = Bounds(free=("monitor",))
 BOTH = Bounds()
-FEW = {"gaps": (4,), "repeats": False}
+FEW: dict[str, Any] = {"gaps": (4,), "repeats": False}
 
 
 def check(bounds: Bounds, measured: Measured, depth: int = 10_000, at_least: int = 0) -> None:

@@ -35,7 +35,7 @@ DIRECTIONS: dict[str, tuple[Pair, Callable[[Allowed], bool]]] = {
     "turn": ((1.0, -1.0), lambda allowed: allowed[2]),
 }
 STILL: Pair = (0.0, 0.0)
-DATA = RobotData(0.03, 0.15, ((0.1, 0.1),) * 4, (0.0, 0.0, 0.0), 8.0, 0.0)  # type: ignore[arg-type]
+DATA = RobotData(0.03, 0.15, ((0.1, 0.1),) * 4, (0.0, 0.0, 0.0), 8.0, 0.0)
 
 
 class Violation(AssertionError):
@@ -310,8 +310,7 @@ class World:
         main, danger = self.main, self.danger
         yield from (main.newest, main.rule._frame_seq, danger.rule._highest_seq)
         yield from (frame.seq for link in self.connections for frame in link.down)
-        judged = danger.rule._judged
-        for frame in (danger.before, danger.newest, danger.rule._newest, judged and judged.frame):
+        for frame in (danger.before, danger.newest, danger.rule._newest):
             if frame is not None:
                 yield frame.seq
 

@@ -72,6 +72,8 @@ class Options:
     stall_every_s: float = 0.0  # frames stop ...
     stall_s: float = 0.1  # ... for this long, and then come at once
     drop_every_s: float = 0.0  # one session is reset
+    restart_at_s: float = 0.0  # it restarts once, with the same boot number, as firmware does that does not count ...
+    restart_s: float = 0.5  # ... and is away for this long
     blocked_beams: float = 0.0  # probability that a channel of the laser has no beam
     lose_replies: float = 0.0  # probability that a laser reply never comes
     laser_ready_after_s: float = 0.0
@@ -349,8 +351,9 @@ class RobotServer:
         self.frame_seq, self.rng = 0, random.Random(options.seed + 1)
         self.answered = asyncio.Event()
         self.wall, self.clock, self.last_due = time.monotonic(), 0.0, 0.0
-        self.counts = {"frames": 0, "bad_lines": 0, "resets": 0, "stalls": 0, "held_s": 0.0, "lost": 0}
+        self.counts = {"frames": 0, "bad_lines": 0, "resets": 0, "stalls": 0, "held_s": 0.0, "lost": 0, "restarts": 0}
         self.held = True
+        self.booted_s = self.away_until_s = 0.0  # of the body's time
         self.last_bad = ""
 
     # motion rules
@@ -381,6 +384,9 @@ class RobotServer:
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         session: Session | None = None
+        if self.body.t < self.away_until_s:
+            writer.transport.abort()
+            return
         try:
             writer.write(encode(self.hello()))
             session = await self.join(reader, writer)
@@ -488,7 +494,20 @@ class RobotServer:
         session.ack = message["ack"]
         self.answered.set()
 
+    def restart(self) -> None:
+        """Begin again without any command; the body stays where it is."""
+        for session in list(self.sessions.values()):
+            self.leave(session)
+        self.drive = self.permit = self.echo = None
+        self.monitor_ever, self.frame_seq = False, 0
+        self.booted_s = self.away_until_s = self.body.t + self.o.restart_s
+        self.counts["restarts"] += 1
+
     # frames
+
+    def since_boot(self, rows: list[list[float]]) -> list[list[float]]:
+        """Samples with the times of the present boot."""
+        return [[round(row[0] - self.booted_s, 6), *row[1:]] for row in rows if row[0] >= self.booted_s]
 
     def frame(self) -> bytes:
         body, now = self.body, self.body.t
@@ -498,9 +517,9 @@ class RobotServer:
         message = {
             "type": "sensors",
             "seq": self.frame_seq,
-            "t": round(now, 6),
-            **body.samples,
-            "gravity": body.gravity_sample,
+            "t": round(now - self.booted_s, 6),
+            **{name: self.since_boot(rows) for name, rows in body.samples.items()},
+            "gravity": next(iter(self.since_boot([body.gravity_sample])), None) if body.gravity_sample else None,
             "fans": body.fans,
             "soc": round(max(0.1, 1 - now / 7200), 4),
             "cmd": {
@@ -534,7 +553,7 @@ class RobotServer:
         per_frame = round(1 / (self.o.frame_hz * STEP_S))
         while self.body.t + STEP_S <= self.clock:
             self.advance(1)
-            if self.body.steps % per_frame == 0:
+            if self.body.steps % per_frame == 0 and self.body.t > self.away_until_s:
                 self.post(self.frame(), now)
 
     def post(self, line: bytes, now: float) -> None:
@@ -557,6 +576,8 @@ class RobotServer:
         next_drop = self.o.drop_every_s or math.inf
         while True:
             self.catch_up()
+            if self.o.restart_at_s and self.body.t > self.o.restart_at_s and not self.counts["restarts"]:
+                self.restart()
             if self.body.t > next_drop:
                 next_drop += self.o.drop_every_s
                 role = self.rng.choice(ROLES)
