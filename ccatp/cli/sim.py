@@ -121,9 +121,19 @@ def conformance(
     """Check a robot-link server, firmware or simulator, against the interface control document.
 
     Wheels turn slowly and for a moment, unless --no-motion. In the end the robot is held, its fans as they were.
+    Exit status: 0 if no check failed, 1 if one failed or cannot be evaluated, 2 for wrong usage or a missing key, 5
+    without a robot.
     """
     from ccatp.commissioning.conformance.motion_checks import notice
-    from ccatp.commissioning.conformance.runner import CHECKS, Conformance, as_json, check_ids, last_line, table_line
+    from ccatp.commissioning.conformance.runner import (
+        CHECKS,
+        UNPROVEN,
+        Conformance,
+        as_json,
+        check_ids,
+        last_line,
+        table_line,
+    )
     from ccatp.config.files import read_key
     from ccatp.config.load import load_config
     from ccatp.config.messages import choice_hint
@@ -151,4 +161,4 @@ def conformance(
         report=lambda result: None if json_output else click.echo(table_line(result)),
     )
     click.echo(json.dumps(as_json(server, results)) if json_output else last_line(results))
-    return FAILED if any(result.outcome == "fail" for result in results) else 0
+    return FAILED if any(result.outcome in UNPROVEN for result in results) else 0

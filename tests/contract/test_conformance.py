@@ -11,14 +11,23 @@ from typing import Any, NamedTuple
 import pytest
 
 from ccatp.cli import main
+from ccatp.commissioning.conformance import runner
 from ccatp.commissioning.conformance.command_checks import check_lost, other_duty
-from ccatp.commissioning.conformance.harness import CheckContext, CheckFailed, Facts, Frame, NotApplicable, parse
+from ccatp.commissioning.conformance.harness import (
+    CheckContext,
+    CheckFailed,
+    ControllerAndMonitor,
+    Facts,
+    Frame,
+    NotApplicable,
+    parse,
+)
 from ccatp.commissioning.conformance.motion_checks import mean_rates
 from ccatp.commissioning.conformance.runner import CHECKS, Conformance, check_ids
 from ccatp.commissioning.conformance.server_checks import check_clock, check_edges, check_gravity, line_fault
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
-from tests.contract.crooked import HONEST, TIMEOUT_S, Crooked, checked, clock, serving
+from tests.contract.crooked import HONEST, TIMEOUT_S, Crooked, Middle, checked, clock, serving
 from tests.faults.table import conformance_rows, load_table
 from tests.support.command import refused
 from tests.support.scenario import config_of, mirror_of
@@ -117,6 +126,55 @@ def test_a_hello_of_no_use_fails_its_check_and_stops_the_others(config: Config) 
     assert results[2].detail == "the hello is of no use: ttl_s = '0.25'"
 
 
+# What the code of a check may raise on data that it did not expect, and on a connection that fails.
+SURPRISES = (
+    IndexError("list index out of range"), KeyError("seq"), ValueError("min() arg is empty"), TypeError("no number"),
+    ZeroDivisionError("float division by zero"), OverflowError("too large"), RecursionError("too deep"),
+    OSError(24, "Too many open files"), AssertionError("no reason"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("error", SURPRISES, ids=lambda error: type(error).__name__)
+def test_whatever_a_check_raises_is_one_undecided_check_and_the_summary_comes(
+    robot: str, error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: CheckContext) -> str:
+        raise error
+
+    broken = tuple(check._replace(run=fail) if check.check_id == "boot" else check for check in CHECKS)
+    monkeypatch.setattr(runner, "CHECKS", broken)
+    assert main(["conformance", robot, "--only", "nonce", "--only", "boot", "--only", "echo"]) == 1
+    nonce, boot, echo, last = capsys.readouterr().out.splitlines()
+    assert re.match(rf"boot +\? +this check cannot be evaluated: {type(error).__name__}: ", boot)
+    assert [line.split()[1] for line in (nonce, echo)] == ["ok", "ok"]
+    assert last == "2 passed, 0 failed, 1 undecided, 0 not applicable"
+
+
+@pytest.mark.parametrize("error", SURPRISES[:2], ids=lambda error: type(error).__name__)
+def test_a_surprise_before_or_after_the_checks_leaves_their_results(
+    robot: str, error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(ControllerAndMonitor, "join", fail)
+    assert main(["conformance", robot, "--json", "--only", "hello", "--only", "echo"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert (result["passed"], result["failed"], result["undecided"]) == (1, 0, 1)
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_a_late_first_frame_of_the_controller_breaks_no_promise(config: Config, lockstep: bool) -> None:
+    def says(message: dict[str, object], middle: Middle) -> dict[str, object] | None:
+        if message["type"] == "joined" and message["role"] == "controller":
+            controllers.append(middle)
+        return None if middle in controllers and 2 < middle.count < 9 else message  # after hello and joined
+
+    controllers: list[Middle] = []
+    results = checked(config, ["seq-session"], lockstep=lockstep, crooked=Crooked("late", says=says))
+    assert [(result.outcome, result.detail) for result in results if result.outcome != "pass"] == []
+
+
 # -- the command ------------------------------------------------------------------------------------------------------
 
 
@@ -156,7 +214,7 @@ def test_the_table(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert re.fullmatch(r"boot +ok +boot \d+ on 8 connections", boot)
     promised = "promised: faults holds names out of the page's list"
     assert re.fullmatch(rf"frames-faults +FAIL +seen: faults\[0\] = 'on_fire'; {promised}", faults)
-    assert last == "1 passed, 1 failed, 0 not applicable"
+    assert last == "1 passed, 1 failed, 0 undecided, 0 not applicable"
     assert captured.err == ""
 
 

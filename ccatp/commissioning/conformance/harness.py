@@ -242,7 +242,7 @@ class RawConnection:
             self.is_ended = True
 
     def receive(self) -> None:
-        """Read the available data; call it only if ``select`` reports data."""
+        """Read the available data; call it only if ``select`` reports data. ``CheckFailed``: an endless line."""
         try:
             data = self._socket.recv(_CHUNK_BYTES)
         except OSError:
@@ -250,7 +250,7 @@ class RawConnection:
         self.is_ended = self.is_ended or not data
         self.lines.extend(self._buffer.feed(data))
         if self._buffer.error is not None:
-            raise self._buffer.error
+            raise CheckFailed(f"the server's line is too long: {self._buffer.error}")
 
     def end(self, ending: Ending) -> None:
         """Send FIN and keep the socket for reading (a close with unread data sends RST), or close with RST."""

@@ -6,11 +6,11 @@ from contextlib import suppress
 from typing import Any, Literal, NamedTuple
 
 from ccatp.commissioning.conformance import command_checks, harness, motion_checks, server_checks
-from ccatp.errors import DaemonUnreachableError, UsageError
+from ccatp.errors import DaemonUnreachableError, UsageError, one_line
 from ccatp.mirror.mirror import Mirror
 
 CHECKS = (*server_checks.CHECKS, *command_checks.CHECKS, *motion_checks.CHECKS)
-Outcome = Literal["pass", "fail", "not applicable"]
+Outcome = Literal["pass", "fail", "not applicable", "undecided"]
 # The only checks that can run if the hello lacks what the other checks need.
 _HELLO_CHECKS = ("hello", "hello-robot")
 _WHY: dict[harness.Need, str] = {
@@ -20,7 +20,9 @@ _WHY: dict[harness.Need, str] = {
     "lockstep": "hello.lockstep is false",
     "hmac": "hello.auth is none",
 }
-_SHORT = {"pass": "ok", "fail": "FAIL", "not applicable": "-"}
+_SHORT = {"pass": "ok", "fail": "FAIL", "not applicable": "-", "undecided": "?"}
+# With these outcomes it is not shown that the server keeps the interface control document.
+UNPROVEN: tuple[Outcome, ...] = ("fail", "undecided")
 
 
 def check_ids() -> tuple[str, ...]:
@@ -109,6 +111,8 @@ class Conformance:
             return "fail", str(failed)
         except harness.NotApplicable as reason:
             return "not applicable", str(reason)
+        except Exception as error:
+            return "undecided", _reason(error)
         finally:
             self._context.clear()
 
@@ -117,8 +121,12 @@ class Conformance:
             connection = self._context.connect()
         except OSError as error:
             raise NoRobot(f"no server at {self._where}: {error.strerror or error}; start it first") from error
-        self._context.until(lambda: bool(connection.lines) or connection.is_ended)
-        self._context.clear()
+        try:
+            self._context.until(lambda: bool(connection.lines) or connection.is_ended)
+        except harness.CheckFailed as failed:
+            raise NoRobot(f"no robot link at {self._where}: {failed}") from failed
+        finally:
+            self._context.clear()
         line = connection.lines[0] if connection.lines else b""
         message = harness.read_message(line)
         if message is None or message.get("type") != "hello":
@@ -130,8 +138,8 @@ class Conformance:
         """Check that no other program holds the robot; store its fan duties and the highest number in use."""
         try:
             frame = harness.ControllerAndMonitor(self._context).expect(lambda _: True, "no frame")
-        except harness.CheckFailed as failed:
-            if "role taken" in str(failed):
+        except Exception as error:
+            if "role taken" in str(error):
                 raise NoRobot(f"another program drives the robot at {self._where}; end it first") from None
         else:
             self._fans = frame.fans[0], frame.fans[1]
@@ -142,7 +150,7 @@ class Conformance:
     def _restore(self) -> None:
         """Restore the fan duties; then end all sessions, so that the wheels are held."""
         self._context.clear()
-        with suppress(harness.CheckFailed, harness.NotApplicable):
+        with suppress(Exception):  # the robot holds itself without a session; the results must still be shown
             pair = harness.ControllerAndMonitor(self._context)
             if self._fans is not None and not pair.steady().has_fans(self._fans):
                 pair.fans(self._fans)
@@ -161,6 +169,7 @@ def as_json(server: str, results: Sequence[Result]) -> dict[str, Any]:
         ],
         "passed": counts["pass"],
         "failed": counts["fail"],
+        "undecided": counts["undecided"],
     }
 
 
@@ -173,4 +182,10 @@ def table_line(result: Result) -> str:
 def last_line(results: Sequence[Result]) -> str:
     """The number of results of each outcome."""
     counts = Counter(result.outcome for result in results)
-    return f"{counts['pass']} passed, {counts['fail']} failed, {counts['not applicable']} not applicable"
+    words: dict[Outcome, str] = {"pass": "passed", "fail": "failed"}
+    words |= {"undecided": "undecided", "not applicable": "not applicable"}
+    return ", ".join(f"{counts[outcome]} {word}" for outcome, word in words.items())
+
+
+def _reason(error: Exception) -> str:
+    return one_line(f"this check cannot be evaluated: {type(error).__name__}: {error}")

@@ -542,6 +542,8 @@ def _seq_of_a_session(pair: ControllerAndMonitor) -> str:
     first = len(pair.messages[0])
     try:
         frame = pair.steady()
+        if len(pair.messages[0]) == first:  # so far only the monitor's frames have arrived
+            pair.expect(lambda _: len(pair.messages[0]) > first, "no frame for the controller in a new session")
     finally:
         context.last_seq = used
     new = pair.messages[0][first]["seq"]
