@@ -38,7 +38,11 @@ DEFAULT_FILE, BEACON_FILE, RECORDING_FILE = "ccatp.toml", "radio.toml", "recordi
 ONBOARD_FILE = "onboard.toml"
 SYSTEMS = ("zigbee", "follow", "cricket")
 _RUN_FILE = "config.toml"  # of a run directory
-_RUN_HEAD = "# The exact configuration of one run; ccatp run --config FILE repeats it.\n\n"
+# Of a run's file. Without its last line the file was cut off: what is missing would be taken from the defaults.
+_RUN_HEAD = "# The exact configuration of one run, to its last line; ccatp run --config FILE repeats it.\n\n"
+_RUN_END = "\n# End of the configuration.\n"
+# Either of them is in the folder of a run before its configuration is.
+_RUN_MARKS = ("origin.json", "mission.sqlite")
 _SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
     "mirror": ("mirrors", MirrorConfig),
     "world": ("worlds", WorldConfig),
@@ -117,12 +121,28 @@ def merged(
 def _layers(base: str, file: Path | None, overrides: Overrides, *, any_ports: bool = False) -> list[ConfigSource]:
     """Command line, the user's file, base: the strongest first."""
     user = read_source(file) if file else ConfigSource("", "", {})
+    if file is not None:
+        _check_whole(file, user)
     command = ConfigSource("command line", "", nested(overrides or {}))
     below = read_source(configs_dir() / base)
     for server in below.tree["sim"].values() if any_ports else ():
         if isinstance(server, dict) and "port" in server:
             server["port"] = 0
     return [command, user, below]
+
+
+def _check_whole(file: Path, source: ConfigSource) -> None:
+    """Refuse the configuration of a run that is empty or cut off; that of another folder may hold any few keys."""
+    if file.name != _RUN_FILE or not any(file.with_name(name).exists() for name in _RUN_MARKS):
+        return
+    if not source.tree:
+        what = "is empty"
+    elif source.text.startswith(_RUN_HEAD) and not source.text.endswith(_RUN_END):
+        what = "is cut off: its last line is missing"
+    else:
+        return
+    advice = "put back a copy, or remove it and name the configuration with --config"
+    raise ConfigError(f"{file}: {what}, so the configuration of the run is not known; {advice}")
 
 
 def _strongest(sources: list[ConfigSource], *keys: Key) -> tuple[ConfigSource, Key]:
@@ -192,7 +212,7 @@ def dump_config(cfg: Config | RadioConfig) -> str:
     """The complete configuration as TOML; the loader of its kind gives an equal one."""
     import tomlkit  # noqa: PLC0415 - only a command that writes a file needs it, and every process reads one
 
-    return _RUN_HEAD + tomlkit.dumps(cfg.model_dump())
+    return _RUN_HEAD + tomlkit.dumps(cfg.model_dump()) + _RUN_END
 
 
 def available(kind: str) -> list[str]:

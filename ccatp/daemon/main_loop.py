@@ -110,6 +110,7 @@ class MainLoop(RobotLoop):
         self.clock = MissionClock(10.0 * cfg.run.step_s if isinstance(cfg, RadioConfig) else cfg.health.clock_jump_s)
         self.frame_period_s = 0.0
         self._is_new_session, self._drives = False, DriveRule()
+        self._is_restarted = args.is_restarted
         self._catches_up_until_s = -inf
         self._was_at_rest = False
         self._levels_sent = 0
@@ -144,7 +145,13 @@ class MainLoop(RobotLoop):
         try:
             self._runner.check_robot(hello)
         except ConfigError as error:
-            self._fail(error)
+            if self.sessions == 1 and not self._is_restarted:
+                self._fail(error)
+            else:  # in the middle of a mission: the run has begun, and its robot may be anywhere
+                where = f"{self.robot_cfg.host}:{self.robot_cfg.port}"
+                what = f"another robot answers at {where} in the middle of the mission: {error}"
+                self._telemetry.notify_operator("error", f"{what}; connect the right one, then 'ccatp run --resume'")
+                self.finish(ExitStatus.HELD)
             return
         self.frame_period_s, self._is_new_session = 1.0 / hello.frame_hz, True
         self._drives.begin_session()

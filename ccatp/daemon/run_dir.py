@@ -33,13 +33,19 @@ FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
 def find_resumable() -> Path | None:
     """The directory of the run that did not finish, ``None`` if there is none with a mission."""
     try:
-        text = os.fsdecode(read_input(FILE).strip())
+        kept = read_input(FILE)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise ConfigError(f"--resume-last: cannot read {FILE}: {error}; remove it to begin a new run") from error
+    text = os.fsdecode(kept.strip())
+    if not text or not kept.endswith(b"\n"):  # written as one whole line
+        raise ConfigError(
+            f"--resume-last: {FILE} is damaged, so the run that did not finish is not known; name it with --resume "
+            "--run-dir, or remove the file to begin a new run with the robot at base"
+        )
     run_dir = Path(text)
-    return run_dir if text and (run_dir / "mission.sqlite").exists() else None
+    return run_dir if (run_dir / "mission.sqlite").exists() else None
 
 
 def find_unfinished() -> Path:
@@ -240,11 +246,20 @@ def _began_simulated(run_dir: Path) -> bool | None:
 
 
 def _read_origin(run_dir: Path) -> dict[str, Any]:
+    """What the file holds, nothing for a run of an older version. ConfigError: it cannot be read, or is damaged."""
+    path = run_dir / ORIGIN_FILE
+    advice = "put back a copy; without the file the run is resumed as one of an older version"
     try:
-        found = json.loads(read_text(run_dir / ORIGIN_FILE))
-    except (OSError, ValueError):
+        found = json.loads(read_text(path))
+    except FileNotFoundError:
         return {}
-    return found if isinstance(found, dict) else {}
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}; {advice}") from error
+    except ValueError:
+        found = None
+    if not (isinstance(found, dict) and isinstance(found.get("simulation"), bool)):
+        raise ConfigError(f"{path}: is empty or damaged; {advice}")
+    return found
 
 
 def read_run_id(run_dir: Path) -> str:

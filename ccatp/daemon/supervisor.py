@@ -18,7 +18,7 @@ from typing import Any
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.files import read_key, write_durably
+from ccatp.config.files import read_toml, write_durably
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.daemon.alarms import AlarmList
@@ -34,7 +34,7 @@ from ccatp.daemon.child_processes import (
     with_addresses,
 )
 from ccatp.daemon.collector import Collector
-from ccatp.daemon.command_handlers import check_observatory
+from ccatp.daemon.named_files import check_named_files
 from ccatp.daemon.process import (
     ADDRESSES_FILE,
     FAULTS_FILE,
@@ -62,7 +62,7 @@ from ccatp.links.liveness import STALE_AFTER_S, Liveness
 from ccatp.links.service_manager import Notifier, is_journal, take_from
 from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat, MissionStatus
 from ccatp.records.recorder import RUN_LOCK
-from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens
+from ccatp.report.dashboard.access import TOKEN_FILE, make_token
 
 # Period of the polls of messages and processes; waking up for each message would double the cost in lockstep.
 POLL_S = 0.02
@@ -314,10 +314,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
     if options.sim and isinstance(cfg, Config):
         _check_physics(cfg.sim.robot.physics, has_faults=options.faults_file is not None)
     # The processes read these files again; checked here, an error is reported before anything has begun.
-    check_observatory(cfg.observatory)
-    read_key(cfg.robot.key_file, must_be_private=not options.sim)
-    if cfg.dashboard.token_file:
-        read_tokens(Path(cfg.dashboard.token_file))
+    check_named_files(cfg, is_sim=options.sim)
     started_s = time.monotonic()
     with ExitStack() as stack:
         configured = str(options.runtime_dir or processes_of(cfg).runtime_dir)
@@ -348,7 +345,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
         (runtime_dir / RUN_DIR_FILE).write_bytes(os.fsencode(run_dir) + b"\n")
         (runtime_dir / ADDRESSES_FILE).write_text(json.dumps(_addresses(cfg)) + "\n", encoding="utf-8")
         if options.faults_file is not None:
-            (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
+            (run_dir / FAULTS_FILE).write_text(read_toml(options.faults_file), encoding="utf-8")
         return SupervisedRun(options, cfg, run_dir, Endpoints(runtime_dir), sockets, locks, page, started_s).run()
 
 

@@ -42,7 +42,7 @@ class CheckpointFile:
         self.failure = ""
         self._encode = msgspec.msgpack.Encoder().encode
         self._is_patient = is_patient
-        self._count = max((count for count, _ in _slots(path.read_bytes())), default=0) if self._is_named else 0
+        self._count = max((count for count, _ in _slots(read_input(path))), default=0) if self._is_named else 0
         self._newest: tuple[int, msgspec.Struct] | None = None
         self._is_durable = self._is_closing = False
         self._wake = threading.Condition()

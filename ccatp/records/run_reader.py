@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
+from ccatp.config.files import read_input
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray, IntArray, PanelId, PointId, Vector3
@@ -175,7 +176,7 @@ class Recording:
         """The recorded configuration with ``overrides``; raises ``ConfigError`` where it cannot be used."""
         beside = self.path.with_name(CONFIG)
         kept = self.metadata.get("config")
-        if kept is None or (beside.is_file() and _readable(beside, Path.read_bytes).decode(errors="replace") == kept):
+        if kept is None or (beside.is_file() and _readable(beside, read_input).decode(errors="replace") == kept):
             return load_config(beside, overrides)
         # A later session of a resumed run has written its own.
         with tempfile.TemporaryDirectory(prefix="ccatp-replay-") as folder:

@@ -487,3 +487,36 @@ def test_an_error_is_an_object_where_json_is_asked_for(tmp_path: Path, capsys: p
     assert json.loads(caught.err) == {
         "error": f"{tmp_path}: no run directory (it has no config.toml); ccatp runs list shows them", "status": 2,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("section", ["robot", "dashboard", "observatory"])
+@pytest.mark.parametrize("kind", ["device", "folder", "pipe", "long", "empty"])
+def test_the_check_of_a_configuration_reads_the_files_that_it_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], section: str, kind: str
+) -> None:
+    named = Path("/dev/zero") if kind == "device" else tmp_path / "named"
+    if kind == "folder":
+        named.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(named)
+    elif kind in ("long", "empty"):
+        named.touch(0o600)
+        os.truncate(named, 1 << 30 if kind == "long" else 0)  # a gigabyte of zeros takes no room on the disk
+    file = tmp_path / "telescope.toml"
+    key = {"robot": "key_file", "dashboard": "token_file", "observatory": "clients_file"}[section]
+    text = f'[{section}]\n{key} = "{named}"\n'
+    if section == "observatory":
+        text += f'key_file = "{named}"\nendpoint = "tcp://127.0.0.1:7020"\n'
+    file.write_text(text)
+    line = refused(capsys, "config", "check", file)
+    assert f"{section}." in line
+    assert str(named) in line
+
+
+def test_a_file_of_another_machine_is_a_warning_of_the_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "telescope.toml"
+    file.write_text(f'[robot]\nkey_file = "{tmp_path / "robot.key"}"\n')
+    assert main(["config", "check", str(file)]) == 0
+    assert "warning: robot.key_file" in capsys.readouterr().err

@@ -274,8 +274,6 @@ def test_a_run_is_found_until_it_has_finished(tmp_path: Path) -> None:
     mark_resumable(run_dir)
     (run_dir / "mission.sqlite").unlink()  # it never began
     assert find_resumable() is None
-    FILE.write_text("")
-    assert find_resumable() is None
 
 
 @pytest.mark.fault("O7")
@@ -404,3 +402,46 @@ def test_folders_that_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
     with pytest.raises(ConfigError, match=f"belongs to user {owner}, not to {owner + 1}"):
         make_runtime_dir(str(tmp_path), {})
+
+
+WHOLE = dump_config(load_config())
+
+
+@pytest.mark.parametrize("mark", ["origin.json", "mission.sqlite"])
+@pytest.mark.parametrize("kept", sorted({0, 1, 2, *range(95, len(WHOLE), 997), len(WHOLE) - 1}))
+def test_no_beginning_of_the_configuration_of_a_run_is_taken_for_all_of_it(
+    tmp_path: Path, mark: str, kept: int
+) -> None:
+    path = tmp_path / "config.toml"
+    (tmp_path / mark).write_text('{"simulation": true, "run_id": "1"}')
+    path.write_text(WHOLE)
+    assert load_config(path) == load_config()
+    path.write_text(WHOLE[:kept])
+    with pytest.raises(ConfigError, match=r"config\.toml"):
+        load_config(path)
+    elsewhere = tmp_path / "of_a_user.toml"
+    elsewhere.write_text("run.seed = 2\n")
+    assert load_config(elsewhere).run.seed == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"null", b"[]", b"{}", b"\0" * 64, b'{"simulation": 1}', b"\xff"])
+def test_a_damaged_origin_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "origin.json").write_bytes(content)
+    for use in (
+        lambda: read_run_id(tmp_path),
+        lambda: with_origin(RunOptions(sim=True, run_dir=tmp_path, resume=True)),
+        lambda: keep_origin(tmp_path, is_sim=True, is_new=False),
+    ):
+        with pytest.raises(ConfigError, match=r"origin\.json: is empty or damaged; put back a copy"):
+            use()
+
+
+@pytest.mark.parametrize("content", [b"", b"\n", b"/runs/a", b"\0" * 8])
+def test_a_damaged_name_of_the_last_run_is_no_new_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "unfinished").write_bytes(content)
+    with pytest.raises(ConfigError, match="is damaged, so the run that did not finish is not known"):
+        find_resumable()
