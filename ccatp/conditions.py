@@ -209,7 +209,7 @@ WHEEL_CREEPS_ON = fault(Group.WHEELS, "the {side} wheel turns while it is held",
     "The robot has crept for a second. Fans to their maximum.",
     "Hold the robot; check fans, brake, slope.", full_fans=True)
 WHEEL_DOES_NOT_STOP = hold(Group.WHEELS, "the {side} wheel turns though it shall stand",
-    "The servo does not come to rest.", "If it repeats, as for a wheel that runs away.")
+    "The servo does not come to rest.", "If it repeats, remove the robot: the servo fails.")
 GRIP_LOST = hold(Group.WHEELS, "the robot loses its grip: it slides downhill over its wheels",
     "Accelerometer and gyroscope show a slide along gravity, its wheels do not. Wheels held, fans to their maximum; "
     "a fault if it slides again within `health.retry_window_s`.",
@@ -220,7 +220,7 @@ GRIP_TOO_LITTLE = fault(Group.WHEELS, "too little grip by the creep of turns: th
     full_fans=True)
 GRIP_LITTLE = slow(Group.WHEELS, "little grip by the creep of turns: less than `robot.thrust_margin`",
     "The same, but full thrust still holds the robot. More thrust, half the speed.",
-    "As above; it ends when turns creep less.")
+    "Tyres or mirror oily? Clean them, or raise the thrust. It ends when turns creep less.")
 YAW_DISAGREES = hold(Group.SENSORS,
     "gyroscope and wheels disagree about the turn: a wheel slips, or the gyroscope is off",
     "They disagree by more than slip and scale errors explain. The robot takes a fix.",
@@ -280,7 +280,7 @@ BATTERY_LOW = go_home(Group.FANS, "the battery has to last for the way home",
     "The charge is enough for the way home with its reserve, but not for more. The robot goes home.",
     "Charge it; `ccatp run --resume` later.")
 BATTERY_REPORTED = go_home(Group.FANS, "the robot reports a low battery",
-    "The robot reports it, and goes home.", "As above.")
+    "The robot reports it, and goes home.", "Charge it; `ccatp run --resume` later.")
 
 # -- seams ------------------------------------------------------------------------------------------------------------
 
@@ -331,8 +331,8 @@ LIFTED = hold(Group.EDGES, "all edge sensors off: lifted or fallen",
     "power. `ccatp resume` when it stands on the mirror again; it takes a fix first.",
     limit='health.lifted_limit_s', full_fans=True)
 ALL_OFF = edge(Group.EDGES, "lifted or fallen",
-    "As above, in its first frame: code 1, no motion is permitted.", "As above.", action=Action.WAIT,
-    motion=Motion.NONE)
+    "All four edge sensors are off, in the first frame: code 1, no motion is permitted.",
+    "Look at the robot before anything else; do not cut the power of its fans.", action=Action.WAIT, motion=Motion.NONE)
 EDGE_SENSOR_STAYS_OFF = hold(Group.SENSORS, "an edge sensor stays off though it was moved back and the others are on",
     "The sensor fails, unless a fix, taken at once, shows a seam or the rim there: then the robot continues by itself.",
     "Clean or replace it. `ccatp resume` continues if it is on again.", action=Action.LOCATE)
@@ -391,9 +391,10 @@ STUCK_AT_EDGE = hold(Group.EDGES, "stuck at the edge: no motion away from it is 
     action=Action.WAIT, clear=Clear.AUTO)
 
 NO_FRAME_FOR = wait(Group.DATA, "no sensors frame for {age_s:.2f} s",
-    "The main loop receives no frames from the robot.", "As above.")
+    "The main loop receives no frames from the robot.", "Is the robot on, the network up?")
 NO_VERDICT = pause(Group.DATA, "no fresh verdict from the danger loop",
-    "The danger loop is too slow, hangs, or is being restarted.", "As for a stale estimate.")
+    "The danger loop is too slow, hangs, or is being restarted.",
+    "Is something else busy on this machine? The supervisor restarts a danger loop that hangs.")
 FRAME_LATE = pause(Group.DATA, "a frame was served {late_ms:.0f} ms late (limit {limit_ms:.0f} ms)",
     "This machine was too slow for one frame.",
     "Nothing, unless it repeats: other programs, or no real-time rights (`no real time` in `log.jsonl`).")
@@ -456,7 +457,8 @@ FIX_NOT_STORED = fault(Group.STORAGE, "the fix of {point} cannot be stored: {why
     "Make room, or end that program; `ccatp resume` measures the point again. Once a write has failed nothing more is "
     "written: `ccatp stop`, then `ccatp run --resume`.")
 SKIP_NOT_STORED = fault(Group.STORAGE, "that {point} is skipped cannot be stored: {why}",
-    "The same for a point that is skipped.", "As above.")
+    "The disk is full or broken, or another program locks the database.",
+    "Make room, or end that program; then `ccatp stop` and `ccatp run --resume`.")
 DISK_STALLS = fault(Group.STORAGE, "the disk stalls: {point} is not stored after {time_s:g} s",
     "The disk does not answer.", "Check the disk; then `ccatp resume`.")
 
@@ -477,7 +479,7 @@ def condition_of(cause: str) -> Condition | None:
     for row in _NAMES:
         fixed = re.split(r"{.*?}", row.message)
         # After a message there may be a duration or a number of repetitions.
-        pattern = ".*".join(map(re.escape, fixed)) + r"(,? (for|again after) .*|; .*)?"
+        pattern = ".*".join(map(re.escape, fixed)) + r"(,? (for|again after|on repetition) .*|; .*)?"
         # Of two rows that match, the longer message counts.
         if (length := sum(map(len, fixed))) > most and re.fullmatch(pattern, cause):
             found, most = row, length

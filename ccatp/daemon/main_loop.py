@@ -277,14 +277,17 @@ class MainLoop(RobotLoop):
             return f"waiting for a measurement of the laser system; {why}"
         # A mission that has not begun has no cause of its own while it waits for a finding of danger to end.
         found = [alarm.cause for alarm in self.alarms.alarms if not alarm.ended]
-        cause = next(iter((*filter(None, (state.cause,)), *found)), str(state.mode))
-        row, otherwise = condition_of(cause), "'ccatp resume' goes on" if state.is_paused else "it goes on by itself"
+        cause = next(iter((*filter(None, (state.cause,)), *found)), "no alarm is active")
+        row, otherwise = condition_of(cause), "'ccatp resume' continues" if state.is_paused else "continues by itself"
         return f"{state.mode}: {cause}; {row.advice if row is not None else otherwise}"
 
     def is_frame_due(self) -> bool:
         return self._unanswered is None
 
     def report_overdue(self, text: str) -> None:
+        self._telemetry.notify_operator("warning", text)
+
+    def report_bad_line(self, text: str) -> None:
         self._telemetry.notify_operator("warning", text)
 
     def on_silence(self, age_s: float) -> None:

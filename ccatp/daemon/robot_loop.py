@@ -44,6 +44,11 @@ class RobotLoop(RobotSession):
         # In lockstep, by the monotonic clock: start of the session, last repeated frame, last repeated answer, last
         # invalid line, and the frame whose successor was reported as overdue.
         self._joined_s = self._repeated_s = self._answered_again_s = self._invalid_s = self._reported_s = 0.0
+        self._explained = 0  # the newest session whose first bad line is reported
+        self._counted: tuple[float, int] = (
+            0.0,
+            0,
+        )  # time of the newest frame, frames with old numbers until then
 
     async def run(self, stop: asyncio.Event) -> None:
         """Join the robot together with the other loop, then serve frames until ``over`` or ``stop`` is set."""
@@ -107,6 +112,15 @@ class RobotLoop(RobotSession):
     def on_bad_line(self) -> None:
         """See ``RobotSession``."""
         self._invalid_s = time.monotonic()
+        if self._explained != self.sessions:  # below the limit of bad lines no other line says what is wrong with them
+            self._explained = self.sessions
+            self.log.warning("bad_line", session=self.sessions, reason=self.link.bad_line)
+            self.report_bad_line(
+                f"a line of the robot is not valid: {self.link.bad_line}; 'ccatp conformance' checks the firmware"
+            )
+
+    def report_bad_line(self, text: str) -> None:
+        """Report the first bad line of a session to the operator; for each loop it is in the log."""
 
     def on_repeated(self) -> None:
         """In lockstep the robot repeats a frame when it has not received an answer of this or the other loop."""
@@ -128,11 +142,19 @@ class RobotLoop(RobotSession):
         self._answer_again_after(REPEAT_S)
         now_s = time.monotonic()
         age_s, silent_s = now_s - frame_s, now_s - max(frame_s, self._repeated_s)
+        old = self.link.counts["repeated_frames"]
+        if self._counted[0] != frame_s:
+            self._counted = frame_s, old
         is_invalid, is_repeated = self._invalid_s > frame_s, self._repeated_s > frame_s
         is_overdue = age_s > INVALID_S if is_invalid else age_s > OVERDUE_S and self.is_frame_due()
         if is_overdue and self._reported_s != frame_s:
             self._reported_s = frame_s
-            sends = "a line that is not valid" if is_invalid else "its last frame again" if is_repeated else "nothing"
+            sends = (
+                "a line that is not valid" if is_invalid
+                else "its last frame again" if is_repeated
+                else "frames with older numbers" if old > self._counted[1]
+                else "nothing"
+            )  # fmt: skip
             self.report_overdue(f"the robot stands: no new frame for {age_s:.1f} s in lockstep; it sends {sends}")
         # The monitor receives no frames before a controller has joined.
         if silent_s > LOCKSTEP_SILENCE_S and (self._role == "controller" or frame_s > self._joined_s):

@@ -153,6 +153,11 @@ class RobotLink(asyncio.Protocol):
         return self._last_seq >= 0
 
     @property
+    def bad_line(self) -> str:
+        """Why the oldest bad line that is kept is none; empty without one."""
+        return self._bad.first_reason
+
+    @property
     def _where(self) -> str:
         return f"{self._host}:{self._port}"
 

@@ -141,4 +141,4 @@ class SeverityEscalation:
         retries = cfg.retries if finding.condition.retries is None else finding.condition.retries
         if len(held) <= retries + 1:
             return finding
-        return finding._replace(severity=Severity.FAULT, cause=f"{finding.cause}, again after {retries} retries")
+        return finding._replace(severity=Severity.FAULT, cause=f"{finding.cause}, on repetition {len(held) - 1}")

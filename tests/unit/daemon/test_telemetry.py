@@ -89,7 +89,7 @@ def test_it_is_reported_after_half_a_minute_and_again_after_each_minute() -> Non
     [
         pytest.param("no way on: walled in", "`ccatp abort`", id="a text that varies"),
         pytest.param("an edge sensor chatters, for 30 s", "Clean it", id="a hold that lasts"),
-        pytest.param("an edge sensor chatters, again after 2 retries", "Clean it", id="a hold that comes again"),
+        pytest.param("an edge sensor chatters, on repetition 3", "Clean it", id="a hold that comes again"),
         pytest.param("nobody has heard of this", "", id="unknown"),
     ],
 )
