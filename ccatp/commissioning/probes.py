@@ -39,7 +39,7 @@ from ccatp.daemon.command_handlers import check_observatory
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.errors import CcatpError, ConfigError
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
-from ccatp.links.robot_link import RobotLink, RobotLinkError
+from ccatp.links.robot_link import ImpossibleRobot, RobotLink, RobotLinkError
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.runtime_dir import make_runtime_dir
 from ccatp.mirror.mirror import Mirror, build_mirror
@@ -143,6 +143,8 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
             await asyncio.wait((is_lost,), timeout=listen_s)
     except RobotLinkError as error:
         todo = "switch the robot on; check [robot] host, port and key_file; end what else drives it"
+        if isinstance(error, ImpossibleRobot):
+            todo = "the robot's own configuration (of ccatp onboard: [link] and [robot]) has to be corrected"
         return without(failed(str(error), todo), "no robot link")
     finally:
         link.close()

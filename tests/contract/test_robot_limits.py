@@ -8,6 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.commissioning.conformance.harness import CheckFailed, Facts, parse
+from ccatp.commissioning.probes import probe_robot
 from ccatp.config.load import load_config, load_onboard_config, load_radio_config
 from ccatp.config.robot_limits import (
     BEACON_FRAME_HZ,
@@ -163,6 +164,19 @@ async def test_the_refusal_names_the_robot_the_value_and_its_limits() -> None:
         )
         with pytest.raises(ImpossibleRobot, match=says):
             await client.join(is_patient=False)
+
+
+@pytest.mark.fault("L18")
+async def test_the_check_before_a_mission_says_what_has_to_be_corrected() -> None:
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(encode(with_value(HELLO, "top_speed_m_s", 0.0003)))
+        await reader.readline()
+
+    async with scripted(talk) as port:
+        cfg = load_config(overrides={"robot.port": port})
+        found = {one.name: one for one in await probe_robot(cfg, mirror_of())}["robot link"]
+    assert "is 0.0003 m/s, the robot link allows 0.02 to 1 m/s" in found.found
+    assert "the robot's own configuration" in found.todo
 
 
 def test_the_simulated_robots_are_within_the_limits() -> None:
