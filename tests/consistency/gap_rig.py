@@ -33,6 +33,7 @@ SILENT = tuple("+".join(part) for n in range(4) for part in combinations(SENSORS
 GAPS_S = 0.05, 0.1, 0.2, 0.5, 1.0, 2.0
 WORLDS = "thesis", "hard", "extreme"
 MOTORS = "lag", "motors"
+FILTERS = "ekf", "ukf", "kf"
 
 _FRAME_S = 0.01
 _RULE_S = 0.17  # danger.stale_after_s and two frames: then a rule of the daemon stops the drive

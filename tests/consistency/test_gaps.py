@@ -1,0 +1,39 @@
+"""Pure but for processes that it forks. In a gap of the samples the localizer knows how wrong it is."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.consistency.gap_campaign import Cell, cells_of, table
+from tests.consistency.gap_rig import FILTERS, MOTORS, SILENT, WAYS, WORLDS, Drive, Way, run
+from tests.faults.linking import Measured
+
+ROW = pytest.mark.fault("S32")
+
+
+def wrong(cells: list[Cell]) -> list[str]:
+    return [cell.text for cell in cells if cell.is_overconfident or cell.is_inflated]
+
+
+@ROW
+def test_a_few_gaps_of_all_encoders(measured: Measured) -> None:
+    """Some seeds of the campaign. Before there was a prediction, the mean NEES of these cells was above 600."""
+    ways, silent = (Way("leg", "rule"), Way("turn", "ttl")), ("", "enc", "imu+enc+edge")
+    drives = [run(Drive("hard", "lag"), seed, ways, silent) for seed in range(3)]
+    cells = cells_of(Drive("hard", "lag"), drives)
+    assert len(cells) == len(ways) * len(silent) * 6
+    assert not wrong(cells)
+    measured("S32", max(cell.excess for cell in cells))
+    measured("S32", max(cell.rms_mm for cell in cells), "mm")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("motors", MOTORS)
+@pytest.mark.parametrize("world", WORLDS)
+def test_every_gap_of_the_campaign(world: str, motors: str, name: str) -> None:
+    drive = Drive(world, motors, name)
+    cells = cells_of(drive, [run(drive, seed, WAYS, SILENT) for seed in range(200)])
+    Path("build").mkdir(exist_ok=True)
+    Path("build", f"gaps_{world}_{motors}_{name}.txt").write_text(table(cells))
+    assert not wrong(cells)
