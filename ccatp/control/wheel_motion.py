@@ -105,7 +105,14 @@ class SentDrives:
         Call it once in each frame, before ``ahead``. ``permit_age_s``: age of the newest permit.
         """
         before, was_held = self._acting, self._was_held
-        now = _HELD if is_held or echo_seq == 0 else next((sent[3] for sent in self._sent if sent[0] == echo_seq), None)
+        now: tuple[float, float] | None = None
+        if is_held or echo_seq == 0:
+            now = _HELD
+        else:
+            for seq, _, _, wheels in self._sent:
+                if seq == echo_seq:
+                    now = wheels
+                    break
         self._acting, self._was_held = now, is_held
         if now is None or before is None or now == before or dt_s <= 0.0:
             return None if now is None else SetPoints(*now)
