@@ -36,6 +36,7 @@ _ROUNDING_S = 1e-6
 _NOMINAL_FRAME_S = 0.01
 _SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # for the error of the heading, from the end of a leg
 _TRUSTED_GAP_S = 0.03  # after a longer gap the odometry of the leg teaches nothing about slip and sensors
+_NOTHING: WheelReadings = (), ()
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
 
 
@@ -115,7 +116,9 @@ class FullStateLocalizer(LocalizerBase):
         set_points: WheelInput,
     ) -> None:
         coasted = None
-        if not (right[0] and left[0]) or self._coast.gap_s:
+        is_right_sparse, is_left_sparse = self._right.is_sparse(right[0], dt_s), self._left.is_sparse(left[0], dt_s)
+        if not (right[0] and left[0]) or self._coast.gap_s or is_right_sparse or is_left_sparse:
+            right, left = _NOTHING if is_right_sparse else right, _NOTHING if is_left_sparse else left
             right, left, coasted = self._coasted(dt_s, right, left, set_points)
         if coasted is None:
             right_rad, left_rad = self._right.add(*right, dt_s), self._left.add(*left, dt_s)

@@ -322,6 +322,8 @@ _SAME_S = 1e-4
 _WHEEL_ACCELERATION_RAD_S2 = 10.0  # limits.a_max_m_s2 and alpha_max_rad_s2 together, on wheels of 30 mm
 # For this time a wheel without samples is assumed to keep its recent rate.
 _BRIDGED_S = 0.1
+_LEARNED = 0.05  # weight of a frame in the usual period
+_LEAST_COVER = 0.5  # least part of a frame that the samples of a counter have to cover
 _LOST = 1.5  # number of periods between two samples of a counter beyond which a sample is missing
 _LATELY_S = 0.05
 _EVEN = 0.05  # part of a period by which the periods of a frame may exceed the shortest one, in sum
@@ -340,6 +342,7 @@ class WheelAngle:
         self.angle_rad = self._gap_rad = self._bridged_s = self._bridged_rad = self._mean_rate = self._rate = 0.0
         self.is_fresh = self.is_counter = self.is_coasting = self.has_lost = False
         self.quantum_rad = self._period_s = inf
+        self._usual_s = 0.0  # mean period of the first samples; the shortest one may be a jitter of the time stamps
         self._t_s = -inf
         self._seen = self._zeros = 0
         self._coasted_rad = 0.0
@@ -372,6 +375,9 @@ class WheelAngle:
             else:
                 self._zeros = 0
         elapsed_s = times_s[-1] - self._t_s
+        if self._seen < _ENOUGH and elapsed_s > 0.0:
+            period_s = elapsed_s / len(times_s)
+            self._usual_s += (period_s - self._usual_s) * (_LEARNED if self._usual_s else 1.0)
         if self._seen >= _ENOUGH and elapsed_s < (len(times_s) + _EVEN) * self._period_s:
             # No sample is missing and the periods are equal, so the sum of the rates is enough.
             total = sum(rates_rad_s)
@@ -386,6 +392,10 @@ class WheelAngle:
             self._bridged_s = self._bridged_rad = 0.0
         self.angle_rad += turned
         return turned
+
+    def is_sparse(self, times_s: Sequence[float], dt_s: float) -> bool:
+        """Whether most samples of a frame of ``dt_s`` are lost. A count is that of its own period only."""
+        return self.is_counter and 0.0 < len(times_s) * self._usual_s < _LEAST_COVER * dt_s
 
     def is_silent(self, t_s: float) -> bool:
         """Whether a frame at ``t_s`` without samples is a gap: the encoder is not merely slower than the frames."""
