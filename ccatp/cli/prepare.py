@@ -145,7 +145,8 @@ def calibrate(
     from ccatp.commissioning.calibration import calibrate as estimate
     from ccatp.commissioning.calibration_drive import read_drive
 
-    drive, on_mirror, cfg = read_drive(from_dir)
+    drive, on_mirror, cfg, warnings = read_drive(from_dir)
+    common.warn(warnings)
     found = estimate(on_mirror, drive, cfg)
     table = rows(_replaced(config_file, cfg), found)
     if not json_output:

@@ -92,9 +92,9 @@ def repair(path: Path, out: Path | None, json_output: bool) -> int:
 def export(path: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: Path | None) -> None:
     """Write a recorded survey for other tools.
 
-    A TUM trajectory is the path for evo and others: deck frame, m, the robot's clock. A ROS 2 bag has every sample as a
-    message of its own, for ROS, Foxglove and PlotJuggler: frame map (the deck), SI units, UTC. Of a run that was
-    resumed the newest recording is taken.
+    A TUM trajectory is the path for evo and others: deck frame, m, and mission time, which is the robot's clock until
+    it restarts or steps. A ROS 2 bag has every sample as a message of its own, for ROS, Foxglove and PlotJuggler: frame
+    map (the deck), SI units, UTC. Of a run that was resumed the newest recording is taken.
     """
     from ccatp.mirror.mirror import build_mirror
     from ccatp.records.recorder import iter_messages
@@ -121,7 +121,7 @@ def export(path: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: 
             if file is not None and trace is not None:
                 common.write_lines(option, file, format_tum(trace).splitlines())
                 click.echo(f"{file}: {len(trace.seq)} poses")
-    common.warn(newest.warnings)
+    common.warn((*newest.notes, *newest.warnings))
 
 
 def _write_bag(folder: Path, recording: "Recording", cfg: "Config", mirror: "Mirror") -> dict[str, int]:
@@ -156,12 +156,15 @@ def _print_facts(facts: "RecordingFacts") -> None:
     if span is not None:
         rate = facts.bytes_per_hour
         per_hour = "" if rate is None else f", {rate / 1e6:.1f} MB an hour"
-        utc = f" of the robot's clock, {' to '.join(facts.utc)}" if facts.utc else ""
+        clock = "mission time" if facts.mission_s else "the robot's clock"
+        utc = f" of {clock}, {' to '.join(facts.utc)}" if facts.utc else ""
         click.echo(f"  {span[0]:.2f} to {span[1]:.2f} s{utc}, {condition.size_bytes / 1e6:.2f} MB{per_hour}")
+    common.print_lines(f"  {note}" for note in facts.notes)
     click.echo(f"  {facts.messages} messages in {condition.chunks} chunks")
     rows = [("topic", "schema", "messages", "per s", "kB")]
     for name, topic in sorted((name, topic) for name, topic in facts.topics.items() if topic.messages):
-        length_s = (topic.end_s or 0.0) - (topic.start_s or 0.0)
+        start_s, end_s = facts.mission_s or (topic.start_s or 0.0, topic.end_s or 0.0)
+        length_s = end_s - start_s
         per_s = f"{(topic.messages - 1) / length_s:.2f}" if topic.messages > 1 and length_s > 0.0 else "-"
         rows.append((name, topic.schema, str(topic.messages), per_s, f"{topic.payload_bytes / 1e3:.1f}"))
     common.print_lines(f"  {line}" for line in common.columns(rows, left=2))

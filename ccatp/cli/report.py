@@ -76,7 +76,7 @@ def plot(run_dir: Path, out: Path | None) -> int:
     from ccatp.report.mirror_map import draw_from_run_dir
 
     picture = out or run_dir / "map.png"
-    draw_from_run_dir(run_dir, picture)
+    common.warn(draw_from_run_dir(run_dir, picture))
     click.echo(picture)
     return 0
 
@@ -178,14 +178,14 @@ def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Pat
         "run_dir": str(run_dir),
         **_replay_facts(configs[-1], parts, settings, is_simulation=recordings[-1].is_simulation),
         **judge(parts),
-        "warnings": [warning for recording in recordings for warning in recording.warnings],
+        "warnings": [warning for recording in recordings for warning in (*recording.notes, *recording.warnings)],
         "wall": {"time_s": round(time.monotonic() - started, 3)},
     }
     common.warn(result["warnings"])
     if out is not None:
         common.write_lines("--out", out, csv_lines(parts))
     is_as_it_was = result["difference"]["reproduced"]
-    may_differ = bool(settings or result["warnings"])
+    may_differ = bool(settings or any(recording.warnings for recording in recordings))
     lines = [*_head(result), *table_lines(result)]
     if is_as_it_was or may_differ:
         lines.append(f"the replay {'reproduces' if is_as_it_was else 'differs from'} the recorded estimates")

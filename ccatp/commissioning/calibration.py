@@ -93,7 +93,9 @@ def calibrate(mirror: Mirror, drive: RecordedDrive, cfg: Config) -> Calibration:
 def _check(drive: RecordedDrive, robot: RobotConfig) -> None:
     if len(drive.segments) < MIN_SEGMENTS:
         raise CalibrationError(
-            f"the drive has {len(drive.segments)} legs with a fix at each end, {MIN_SEGMENTS} are needed; drive again"
+            f"the drive has {len(drive.segments)} legs with a fix at each end, {MIN_SEGMENTS} are needed"
+            + (f" ({drive.left_out} are left out)" if drive.left_out else "")
+            + "; drive again"
         )
     turns = [
         robot.wheel_radius_m / robot.wheel_base_m * abs(float((s.right_rad - s.left_rad).sum())) for s in drive.segments
@@ -153,8 +155,8 @@ class _Problem(NamedTuple):
         wheels = WheelParameters(*x[[RIGHT, LEFT, BASE, CREEP]].tolist())
         starts = x[PARAMETERS:].reshape(-1, 3)
         return [
-            carry(self.mirror, segment, start, wheels)
-            for segment, start in zip(self.drive.segments, starts[:-1], strict=True)
+            carry(self.mirror, segment, starts[start], wheels)
+            for segment, start in zip(self.drive.segments, self.drive.starts, strict=True)
         ]
 
     def _whitened(
@@ -175,7 +177,7 @@ class _Problem(NamedTuple):
             jacobian[:, at : at + 2] = np.eye(2)
             add(jacobian, np.array((place.x_m, place.y_m)) - x[at : at + 2], place.covariance_m2)
         for k, (segment, led) in enumerate(zip(drive.segments, carried, strict=True)):
-            at = PARAMETERS + 3 * k
+            at = PARAMETERS + 3 * drive.starts[k]
             jacobian = np.zeros((3, size))
             jacobian[:, at + 3 : at + 6] = np.eye(3)
             jacobian[:, at : at + 3] = -led.of_start
@@ -190,15 +192,23 @@ class _Problem(NamedTuple):
 
 
 def _first_guess(mirror: Mirror, drive: RecordedDrive, robot: RobotConfig) -> FloatArray:
-    """Positions from the fixes, headings from the wheels; the first one turns the first segment to the second fix."""
+    """Positions from the fixes, headings from the wheels; the first one turns the first segment to the second fix.
+
+    After a segment that was left out, the longest segment of those that follow it gives the heading.
+    """
     wheels = WheelParameters(robot.wheel_radius_m, robot.wheel_radius_m, robot.wheel_base_m, 0.0)
     poses = np.zeros((len(drive.places), 3))
     poses[:, :2] = [(place.x_m, place.y_m) for place in drive.places]
-    went = carry(mirror, drive.segments[0], poses[0], wheels).end[:2] - poses[0, :2]
-    seen = poses[1, :2] - poses[0, :2]
-    poses[0, 2] = np.arctan2(seen[1], seen[0]) - np.arctan2(went[1], went[0])
-    for k, segment in enumerate(drive.segments):
-        poses[k + 1, 2] = carry(mirror, segment, poses[k], wheels).end[2]
+    for number, chain in enumerate(drive.chains):
+        segments, first = [drive.segments[j] for j in chain], drive.starts[chain[0]]
+        lengths_m = np.linalg.norm(np.diff(poses[first : first + len(chain) + 1, :2], axis=0), axis=1)
+        at = int(np.argmax(lengths_m)) if number else 0
+        turned_rad = sum(carry(mirror, segments[j], poses[first + j], wheels).end[2] for j in range(at))
+        went = carry(mirror, segments[at], poses[first + at], wheels).end[:2] - poses[first + at, :2]
+        seen = poses[first + at + 1, :2] - poses[first + at, :2]
+        poses[first, 2] = np.arctan2(seen[1], seen[0]) - np.arctan2(went[1], went[0]) - turned_rad
+        for j, segment in enumerate(segments):
+            poses[first + j + 1, 2] = carry(mirror, segment, poses[first + j], wheels).end[2]
     return np.concatenate((wheels, [0.0, 0.0], poses.ravel()))
 
 
@@ -224,7 +234,7 @@ def _gyro_row(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Integrated gyroscope rate: (1 + scale) (change of heading - part of the surface's curvature) + bias * time."""
     segment = drive.segments[k]
-    at = PARAMETERS + 3 * k
+    at = PARAMETERS + 3 * drive.starts[k]
     start_rad, end_rad = float(x[at + 2]), float(x[at + 5])
     curvature_rad = float(carried.end[2]) - start_rad - carried.turn_rad
     turned_rad = end_rad - start_rad - curvature_rad

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from math import sqrt
+from math import hypot, sqrt
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -25,6 +25,8 @@ REST_SIGMAS = 6.0
 SLOW_RAD = 3e-5
 # Rests shorter than this do not separate motions.
 REST_FRAMES = 5
+# A part of a drive between two segments that are left out shows its heading only if it is longer than this.
+LEAST_WAY_M = 0.05
 # Median absolute difference of two normal samples to the standard deviation of one sample.
 _MEDIAN_TO_SIGMA = 1.0 / (0.6745 * 2.0**0.5)
 
@@ -53,7 +55,11 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class RecordedDrive:
-    """A whole drive: k + 1 places and the k segments between them."""
+    """A whole drive: places, and the segments from place ``starts[j]`` to the next one.
+
+    Without a segment that was left out these are k + 1 places and the k segments between them. ``left_out``: segments
+    in which the robot restarted, its clock stepped, or frames are missing.
+    """
 
     places: tuple[FixedPlace, ...]
     segments: tuple[Segment, ...]
@@ -61,6 +67,15 @@ class RecordedDrive:
     encoder_period_s: float
     quantum_rad: float  # one count of a counter; 0 if the encoder measures the rate
     gyro_sigma_rad_s: float
+    starts: tuple[int, ...]
+    left_out: int = 0
+
+    @property
+    def chains(self) -> list[range]:
+        """Segments that follow one another without one that was left out, in their order."""
+        cuts = [j for j in range(1, len(self.starts)) if self.starts[j] != self.starts[j - 1] + 1]
+        ends = [0, *cuts, len(self.starts)]
+        return [range(begin, end) for begin, end in pairwise(ends)] if self.starts else []
 
 
 @dataclass(slots=True)
@@ -71,6 +86,7 @@ class _Open:
     gyro_s: float = 0.0
     gyro_samples: int = 0
     begun_s: float = 0.0
+    has_jump: bool = False
 
 
 class DriveBuilder:
@@ -87,14 +103,25 @@ class DriveBuilder:
         self._samples = 0
         self._gyro_steps: list[float] = []
         self._gyro: tuple[float, float] | None = None
-        self._last_seq = -1
+        self._last: int | None = None
         self._t_s = 0.0
+        self._starts: list[int] = []
+        self._left_out = 0
 
-    def frame(self, sensors: Sensors) -> None:
-        """Add a frame; a frame that is not newer than the last one is ignored."""
-        if sensors.seq <= self._last_seq:
+    def leave_out_leg(self) -> None:
+        """Leave out the segment of the next frame: its samples or their times do not go on from those before it."""
+        self._open.has_jump = True
+        self._gyro = None
+        for wheel in self._wheels:
+            wheel.restart()
+
+    def frame(self, number: int, sensors: Sensors) -> None:
+        """Add a frame by its number in the recording; one that is not newer than the last one is ignored."""
+        if self._last is not None and number <= self._last:
             return
-        self._last_seq, self._t_s = sensors.seq, sensors.t
+        if self._last is not None and number > self._last + 1:
+            self.leave_out_leg()
+        self._last, self._t_s = number, sensors.t
         right = [(row[0], row[1]) for row in sensors.enc if row[1] is not None]
         left = [(row[0], row[2]) for row in sensors.enc if row[2] is not None]
         for wheel, samples, turned in zip(
@@ -123,6 +150,10 @@ class DriveBuilder:
         if not self._places:
             self._places.append(place)
             return
+        if done.has_jump:
+            self._left_out += 1
+            self._places.append(place)
+            return
         right, left = np.array(done.right), np.array(done.left)
         motions = _motions(right, left, self._rest_rad())
         if not motions:
@@ -130,6 +161,7 @@ class DriveBuilder:
             self._places[-1] = place
             self._open = replace(done, right=[], left=[], begun_s=self._t_s)
             return
+        self._starts.append(len(self._places) - 1)
         self._places.append(place)
         duration_s = self._t_s - done.begun_s
         self._segments.append(Segment(right, left, motions, done.gyro_rad, done.gyro_s, done.gyro_samples, duration_s))
@@ -156,14 +188,34 @@ class DriveBuilder:
         right, left = self._wheels
         is_counter = right.is_counter or left.is_counter
         quantum = min(right.quantum_rad, left.quantum_rad) if is_counter else 0.0
+        kept = self._kept()
+        index = {place: k for k, place in enumerate(kept)}
         return RecordedDrive(
-            tuple(self._places),
-            tuple(self._segments),
+            tuple(self._places[k] for k in kept),
+            tuple(segment for segment, start in zip(self._segments, self._starts, strict=True) if start in index),
             0.0 if is_counter or not self._scatters else median(self._scatters),
             median(self._periods) if self._periods else 0.0,
             quantum,
             median(self._gyro_steps) * _MEDIAN_TO_SIGMA if self._gyro_steps else 0.0,
+            tuple(index[start] for start in self._starts if start in index),
+            self._left_out,
         )
+
+    def _kept(self) -> list[int]:
+        """The places that determine a pose: where a segment was left out, the heading needs a way on either side."""
+        if not self._left_out:
+            return list(range(len(self._places)))
+        kept: list[int] = []
+        chain: list[int] = []
+        for place in range(len(self._places)):
+            chain.append(place)
+            if place in self._starts:
+                continue
+            first = self._places[chain[0]]
+            ways_m = [hypot(self._places[k].x_m - first.x_m, self._places[k].y_m - first.y_m) for k in chain]
+            kept += chain if max(ways_m) >= LEAST_WAY_M else []
+            chain = []
+        return kept
 
 
 def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tuple[int, int], ...]:
@@ -277,8 +329,17 @@ def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: WheelPara
 MAX_FIXES = 60
 
 
-def read_drive(run_dir: Path) -> tuple[RecordedDrive, Mirror, Config]:
-    """Drive (up to ``MAX_FIXES`` fused fixes), mirror and configuration of a run's newest recording.
+class ReadDrive(NamedTuple):
+    """A drive with mirror and configuration of its run; ``warnings``: what was left out, one line each."""
+
+    drive: RecordedDrive
+    mirror: Mirror
+    cfg: Config
+    warnings: tuple[str, ...]
+
+
+def read_drive(run_dir: Path) -> ReadDrive:
+    """Drive (up to ``MAX_FIXES`` fused fixes) of a run's newest recording.
 
     Raises RunReadError: no recording can be read. Raises ConfigError: its configuration cannot be used.
     """
@@ -286,12 +347,20 @@ def read_drive(run_dir: Path) -> tuple[RecordedDrive, Mirror, Config]:
     cfg = recording.config({})
     mirror = build_mirror(cfg.mirror)
     builder, fixes = DriveBuilder(mirror, cfg.robot.puck_height_m), 0
+    steps = {step.number for step in recording.timeline.steps}
     for event in in_order(recording.messages()):
         if isinstance(event, Marked):
-            builder.frame(event.sensors)
+            if event.number in steps:
+                builder.leave_out_leg()
+            builder.frame(event.number, event.sensors)
         elif event.was_fused:
             builder.fix(event.fix)
             fixes += 1
             if fixes == MAX_FIXES:
                 break
-    return builder.build(), mirror, cfg
+    drive, warnings = builder.build(), [*recording.notes, *recording.warnings]
+    if drive.left_out:
+        legs = "1 leg is" if drive.left_out == 1 else f"{drive.left_out} legs are"
+        why = "a restart of the robot, a step of its clock or missing frames"
+        warnings.append(f"{recording.path}: {legs} left out of the calibration because of {why}")
+    return ReadDrive(drive, mirror, cfg, tuple(warnings))

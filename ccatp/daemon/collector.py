@@ -28,6 +28,7 @@ from ccatp.links.topics import (
     Heartbeat,
     Message,
     MissionStatus,
+    SessionMessage,
     Timing,
     TrackMessage,
     TruthMessage,
@@ -40,11 +41,11 @@ from ccatp.records.recorder import (
     Recorder,
     RobotClock,
     decode_recorded,
-    iter_messages,
     recordings,
 )
 from ccatp.records.store import StoredSurvey, StoreError, read_survey
 from ccatp.records.summary import PanelFits, SummaryBuilder
+from ccatp.records.timeline import iter_places, read_timeline
 from ccatp.report.foxglove import Views, recorded_schemas
 
 if TYPE_CHECKING:
@@ -200,6 +201,7 @@ class _SurveySession:
 
     def __init__(self, cfg: Config, mirror: Mirror, *, is_sim: bool) -> None:
         self._mirror, self._code, self.has_status = mirror, 0, False
+        self._frames_before = 0  # of the robot's present boot; danger names frames by the robot's own numbers
         self.builder = SummaryBuilder(cfg, mirror, is_sim=is_sim)
 
     def take(self, message: Message) -> None:
@@ -217,8 +219,10 @@ class _SurveySession:
             builder.add_ticks(message.tick_us)
         elif isinstance(message, DangerEvent):
             if message.code != self._code:
-                builder.add_verdict_event(message.seq, message.code)
+                builder.add_verdict_event(message.seq + self._frames_before, message.code)
             self._code = message.code
+        elif isinstance(message, SessionMessage):
+            self._frames_before = message.frames_before
         elif isinstance(message, MissionStatus):
             if not self.has_status:  # only the first: a main loop that takes over plans only the rest
                 self.has_status = True
@@ -262,9 +266,10 @@ class SurveyRecord:
         builder.set_panels({} if survey is None else self._fits(survey), self._injected)
         for path in reversed(recordings(self._run_dir / TELEMETRY)[:-1]):
             earlier = _SurveySession(self._cfg, self.mirror, is_sim=self._is_sim)
-            for topic, _, payload in iter_messages(path):
+            timeline = read_timeline(path, is_simulation=self._is_sim)
+            for place, topic, _, payload in iter_places(path):
                 if topic in SUMMARISED and isinstance(message := decode_recorded(topic, payload), Message):
-                    earlier.take(message)
+                    earlier.take(timeline.on_axis(place, message))
             if earlier.has_status:
                 builder.precede(earlier.builder)
         return builder.build(wall_s)

@@ -160,6 +160,7 @@ class MainLoop(RobotLoop):
         again = " again" if self.sessions > 1 else ""
         robot = self.robot_cfg
         self._telemetry.notify_operator("info", f"joined the robot at {robot.host}:{robot.port}{again}")
+        self._telemetry.begin_session(hello.boot, self.link.session)
 
     def on_restarted(self) -> None:
         self._telemetry.notify_operator("warning", "the robot restarted: relocalizing before it moves")

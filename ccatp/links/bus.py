@@ -24,6 +24,7 @@ from ccatp.links.topics import (
     LogMessage,
     Message,
     SensorLines,
+    SessionMessage,
     Timing,
     last_estimate_before,
 )
@@ -386,6 +387,14 @@ class Telemetry:
     def continue_numbering(self) -> None:
         """The robot's frames restarted: the recorded numbers continue after the newest known frame."""
         self.frames_before += max(self.seq, 0)
+
+    def begin_session(self, boot: int, session: int) -> None:
+        """Record which frames come from now on; batches do not go over it."""
+        self.flush()
+        self.send(
+            "session",
+            SessionMessage(seq=self.seq, t_s=self.t_s, boot=boot, session=session, frames_before=self.frames_before),
+        )
 
     def add_frame(self, seq: int, t_s: float, raw: bytes, row: tuple[Any, ...]) -> None:
         """Keep the line of frame ``seq`` and its row of the track, which has the recorded number."""

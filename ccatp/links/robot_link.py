@@ -114,6 +114,7 @@ class RobotLink(asyncio.Protocol):
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
         newest: the newest frame of the session.
+        session: the robot's number of the session, once it is joined.
     """
 
     def __init__(
@@ -143,7 +144,7 @@ class RobotLink(asyncio.Protocol):
         self._lines = LineBuffer()
         self._bad = BadLineCounter()
         self._budget: BadLineLimit | None = None
-        self._last_seq = -1
+        self._last_seq = self.session = -1
         self.newest: Sensors | None = None
         self._why = self._oddity = ""
 
@@ -254,7 +255,7 @@ class RobotLink(asyncio.Protocol):
         elif isinstance(message, Hello) and self._hello is None:
             self._answer(message, joining)
         elif isinstance(message, Joined) and self._hello is not None and message.role == self._role:
-            self._is_joined = True
+            self._is_joined, self.session = True, message.session
             if not self._hello.lockstep:  # in lockstep the client sets the frame rate
                 rate_hz = self._hello.frame_hz
                 self._budget = BadLineLimit(BACKLOG_S * rate_hz, FLOOD_FACTOR * rate_hz)

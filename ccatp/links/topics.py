@@ -192,6 +192,17 @@ class Treatment(Message):
     values: tuple[float, ...] = ()
 
 
+class SessionMessage(Message):
+    """Main joined the robot: frames recorded from here on are of this boot and session of the robot.
+
+    ``frames_before``: the number of a frame in ``track`` and ``arrival`` is the robot's ``seq`` plus this.
+    """
+
+    boot: int
+    session: int
+    frames_before: int
+
+
 class DangerEvent(Message):
     """The verdict's code, cause or severity changed; without a cause nothing is found any more.
 
@@ -231,10 +242,12 @@ class TruthMessage(Message):
     """A batch of simulated truth (simulation only).
 
     Rows: seq, t_s, x_m, y_m, heading_rad (deck), X, Y, Z (surface point, deck, m), clearance of the worst edge sensor
-    to the rim (m), fallen (0 or 1), mask of the edge sensors beyond the rim (bit 0 = front left).
+    to the rim (m), fallen (0 or 1), mask of the edge sensors beyond the rim (bit 0 = front left). ``boots``: ``seq``
+    before the first frame of each boot of the robot; the truth counts on over them. Empty in older recordings.
     """
 
     rows: list[tuple[int, float, float, float, float, float, float, float, float, int, int]]
+    boots: list[int] = []
 
 
 class Misalignment(Message):
@@ -320,6 +333,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("mission", MissionStatus, "main", 10.0, 1.0, True),
     Topic("track", TrackMessage, "main", 1.0, 0.0, True),
     Topic("sensors", SensorLines, "main", 1.0, 0.0, True),
+    Topic("session", SessionMessage, "main", 0.0, 0.0, True),
     Topic("arrival", ArrivalMessage, "main", 0.0, 0.0, True),
     Topic("rest", Rest, "main", 0.0, 0.0, True),
     Topic("treatment", Treatment, "main", 0.0, 0.0, True),

@@ -8,6 +8,7 @@ import json
 import mmap
 import struct
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -57,38 +58,65 @@ _METADATA = "ccatp"
 _SIMULATION = "simulation"
 _MAX_T_S = 1e9  # thirty years: a larger time is not a time since boot
 _NS = 1e9
-_CLOCK_BACK_S = 10.0  # batches and events are this much out of order at most
+_CLOCK_OFF_S = 10.0  # batches and events are this much out of order at most
+_CLOCKS = 8  # that are remembered
 _COMPARED_S, _UTC_OFF_NS = 10.0, 20_000_000
 
 
-class RobotClock:
-    """UTC of the robot's clock: compared at its first time, and again if it went back because the robot restarted.
+@dataclass(slots=True)
+class _ClockBase:
+    """One of the clocks: UTC at its time 0, in force and by the least delay; its last compared time."""
 
-    Of a real robot they are compared every ``_COMPARED_S``, and UTC is corrected where it is off by ``_UTC_OFF_NS``. In
-    a simulation UTC advances with the robot's clock, in lockstep faster than the clock of this machine.
+    zero_ns: int
+    least_ns: int
+    compared_s: float
+
+
+class RobotClock:
+    """UTC of the times in messages: compared at the first time, and again for a time that fits no clock so far.
+
+    Such times come when the robot restarts, its clock is set, or wraps. The times of the mission and of the simulated
+    truth then go on by the clock from before. Of a real robot they are compared every ``_COMPARED_S``, and UTC is
+    corrected where it is off by ``_UTC_OFF_NS``. In a simulation UTC advances with the robot's clock, in lockstep
+    faster than the clock of this machine.
     """
 
     def __init__(self, *, is_simulation: bool, now_ns: Callable[[], int] = time.time_ns) -> None:
         self._is_simulation, self._now_ns = is_simulation, now_ns
-        self._zero_ns = self._least_ns = 0  # UTC at time 0 of the robot: in force, and by the least delay
-        self._newest_s = self._compared_s = 0.0
+        self._bases: deque[_ClockBase] = deque(maxlen=_CLOCKS)
+        self._newest_ns = 0
 
     def utc_ns(self, t_s: float) -> int:
         """UTC of robot time ``t_s``, ns since 1970; of a message without a time (0) that of the newest one."""
         now_ns = self._now_ns()
-        if t_s > 0.0:
-            self._compare(t_s, now_ns - round(t_s * _NS))
-        return self._zero_ns + round((t_s or self._newest_s) * _NS) if self._zero_ns else now_ns
+        if t_s <= 0.0:
+            return self._newest_ns or now_ns
+        base = self._base_of(t_s, now_ns)
+        self._compare(base, t_s, now_ns - round(t_s * _NS))
+        utc_ns = base.zero_ns + round(t_s * _NS)
+        self._newest_ns = max(self._newest_ns, utc_ns)
+        return utc_ns
 
-    def _compare(self, t_s: float, zero_ns: int) -> None:
-        if not self._zero_ns or t_s < self._newest_s - _CLOCK_BACK_S:
-            self._zero_ns = self._least_ns = zero_ns
-            self._newest_s = self._compared_s = t_s
-        self._newest_s, self._least_ns = max(self._newest_s, t_s), min(self._least_ns, zero_ns)
-        if not self._is_simulation and t_s - self._compared_s >= _COMPARED_S:
-            if abs(self._least_ns - self._zero_ns) >= _UTC_OFF_NS:
-                self._zero_ns = self._least_ns
-            self._least_ns, self._compared_s = zero_ns, t_s
+    def _base_of(self, t_s: float, now_ns: int) -> _ClockBase:
+        """The clock by which ``t_s`` is nearest to the present; a new one if it is too far from it by all of them."""
+        present_ns = self._newest_ns if self._is_simulation else now_ns
+        off_s = [(base.zero_ns - present_ns) / _NS + t_s for base in self._bases]
+        near = [(abs(off), k) for k, off in enumerate(off_s) if abs(off) <= _CLOCK_OFF_S]
+        if not near and self._is_simulation:  # its time may pass without a message
+            near = [(off, k) for k, off in enumerate(off_s) if off > 0.0]
+        if near:
+            return self._bases[min(near)[1]]
+        begin_ns = max(now_ns, self._newest_ns) if self._is_simulation else now_ns
+        zero_ns = begin_ns - round(t_s * _NS)
+        self._bases.append(_ClockBase(zero_ns, zero_ns, t_s))
+        return self._bases[-1]
+
+    def _compare(self, base: _ClockBase, t_s: float, zero_ns: int) -> None:
+        base.least_ns = min(base.least_ns, zero_ns)
+        if not self._is_simulation and t_s - base.compared_s >= _COMPARED_S:
+            if abs(base.least_ns - base.zero_ns) >= _UTC_OFF_NS:
+                base.zero_ns = base.least_ns
+            base.least_ns, base.compared_s = zero_ns, t_s
 
 
 class RecordedMessage(NamedTuple):
@@ -321,27 +349,41 @@ def iter_messages(path: Path, on_damage: Callable[[str], None] | None = None) ->
 def iter_logged(
     path: Path, on_damage: Callable[[str], None] | None = None
 ) -> Iterator[tuple[int | None, RecordedMessage]]:
-    """All messages of a file in the order of recording, up to its end or to the first damage.
+    """All intact messages of a file in the order of recording.
 
     Each comes with UTC minus the robot's clock, ns since 1970; None in recordings up to format 2.
 
-    The file may end anywhere, as after a ``kill -9``; a damaged chunk gives none of its messages. ``on_damage`` is
-    called with the reason where the file ends early or is damaged. ``OSError``: the file cannot be read.
+    The file may end anywhere, as after a ``kill -9``; a damaged chunk gives none of its messages, and what follows it
+    is read. ``on_damage`` is called at the end with the reason where the file ends early or is damaged. ``OSError``:
+    the file cannot be read.
     """
     channels: dict[int, str] = {}
     condition = Condition()
+    has_searched = False
     for record in scan(path, condition):
-        if condition.lost:
-            break
         if isinstance(record, Channel):
             channels[record.id] = record.topic
-        elif isinstance(record, Message) and record.channel_id in channels:
+        elif isinstance(record, Message):
+            if record.channel_id not in channels and not has_searched:
+                # The chunk that names it is damaged; the end of a file repeats all names.
+                has_searched = True
+                channels |= {one.id: one.topic for one in scan(path, Condition()) if isinstance(one, Channel)}
+            if record.channel_id not in channels:
+                continue
             # Up to format 2 both times are the robot's.
             utc_offset_ns = record.log_time - record.publish_time or None
             yield utc_offset_ns, RecordedMessage(channels[record.channel_id], record.publish_time / _NS, record.data)
     if on_damage is not None and not condition.is_complete:
-        at = condition.lost[0][0] if condition.lost else condition.size_bytes
-        on_damage(f"{path}: damaged or cut off at byte {at}")
+        on_damage(_damage(path, condition))
+
+
+def _damage(path: Path, condition: Condition) -> str:
+    """Where a file is damaged, and how much of it is lost."""
+    if not condition.lost:
+        return f"{path}: damaged or cut off at byte {condition.size_bytes}"
+    where = f"{path}: damaged or cut off at byte {condition.lost[0][0]}"
+    more = f" and in {len(condition.lost) - 1} more places" if len(condition.lost) > 1 else ""
+    return f"{where}{more}, {condition.lost_bytes} of {condition.size_bytes} bytes are lost and left out"
 
 
 def read_metadata(path: Path) -> dict[str, str]:
@@ -361,7 +403,7 @@ def damage_text(path: Path, damage: str) -> str:
     """Why a recording could not be read to its end, for a reader of the run."""
     if is_being_written(path):
         return f"{path.name}: still being written; what it holds so far is in this report"
-    return f"{damage.replace(str(path), path.name)}; what came before it is in this report"
+    return f"{damage.replace(str(path), path.name)}; the rest is in this report"
 
 
 RECORD_FORMAT = 3

@@ -14,6 +14,7 @@ from mcap.writer import Writer
 
 from ccatp.errors import UsageError
 from ccatp.records.recorder import CHUNK_BYTES, DAMAGE, MAGIC, TELEMETRY, Condition, is_being_written, recordings, scan
+from ccatp.records.timeline import read_timeline
 
 NO_INDEX = "no index: it was not closed"
 _NS = 1e9
@@ -52,7 +53,10 @@ def _text(error: Exception) -> str:
 
 @dataclass(slots=True)
 class TopicFacts:
-    """Content of a topic; ``payload_bytes`` of all messages, before compression; times None without a message."""
+    """Content of a topic; ``payload_bytes`` of all messages, before compression.
+
+    Times are of the robot's clock; None without a message, and in a recording in which this clock steps.
+    """
 
     schema: str
     messages: int = 0
@@ -63,7 +67,11 @@ class TopicFacts:
 
 @dataclass(slots=True)
 class RecordingFacts:
-    """Content of a recording; ``faults`` are the objections of the format's own strict reader."""
+    """Content of a recording; ``faults`` are the objections of the format's own strict reader.
+
+    ``notes``: restarts of the robot and steps of its clock, and missing frames, one line each. ``mission_s``: mission
+    times of the first and the last frame, where the robot's clock steps.
+    """
 
     path: Path
     condition: Condition
@@ -72,6 +80,8 @@ class RecordingFacts:
     faults: list[str] = field(default_factory=list)
     is_being_written: bool = False
     utc_ns: tuple[int, ...] = ()  # of the first and the last message, since 1970
+    notes: list[str] = field(default_factory=list)
+    mission_s: tuple[float, float] | None = None
 
     @property
     def utc(self) -> list[str]:
@@ -97,7 +107,9 @@ class RecordingFacts:
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """Times of the first and the last message."""
+        """Times of the first and the last message; where the robot's clock steps, of the first and the last frame."""
+        if self.mission_s is not None:
+            return self.mission_s
         times = [(one.start_s, one.end_s) for one in self.topics.values()]
         starts, ends = ([t_s for t_s in column if t_s is not None] for column in zip(*times, strict=True))
         return (min(starts), max(ends)) if starts else None
@@ -121,6 +133,7 @@ class RecordingFacts:
             "verified": not self.faults,
             "being_written": self.is_being_written,
             "faults": self.faults,
+            "notes": self.notes,
             "size_bytes": self.condition.size_bytes,
             "lost_bytes": self.condition.lost_bytes,
             "lost": self.condition.lost,
@@ -168,12 +181,26 @@ def read_facts(path: Path) -> RecordingFacts:
                 if record.log_time != record.publish_time:  # the same in recordings up to format 2
                     times_ns = *facts.utc_ns, record.log_time
                     facts.utc_ns = min(times_ns), max(times_ns)
+        _add_axis(facts, path)
         facts.is_being_written = is_being_written(path)
         facts.faults = strict_faults(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     _check_is_recording(path, facts.topics, condition)
     return facts
+
+
+def _add_axis(facts: RecordingFacts, path: Path) -> None:
+    """Replace times by the robot's clock, where it steps, by mission times."""
+    is_simulation = any(record.get("simulation") == "true" for record in facts.metadata.values())
+    timeline = read_timeline(path, is_simulation=is_simulation)
+    facts.notes += timeline.notes
+    if timeline.missing:
+        facts.notes.append(f"{timeline.missing} frames are missing in between")
+    if timeline.steps:
+        facts.mission_s = float(timeline.t_s[0]), float(timeline.t_s[-1])
+        for topic in facts.topics.values():
+            topic.start_s = topic.end_s = None
 
 
 class Saved(NamedTuple):

@@ -25,13 +25,16 @@ from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import RECORD_FORMAT, TELEMETRY, decode_recorded, iter_messages, read_metadata, recordings
 from ccatp.records.store import StoreError, read_survey
+from ccatp.records.timeline import Timeline, first_of_each, iter_places, read_timeline
 
 Injected = dict[PanelId, Vector3]  # piston (m), tip and tilt (rad)
 
 
 class Marked(NamedTuple):
-    """A frame, and the treatment of the localizer in it."""
+    """A frame, and the treatment of the localizer in it; number and mission time as in ``ccatp.records.timeline``."""
 
+    number: int
+    t_s: float
     sensors: Sensors
     at_rest: bool
     begun: tuple[float, ...] | None = None  # before the frame it was reset, with these values of ``Treatment``
@@ -41,8 +44,13 @@ class Marked(NamedTuple):
 
 
 class Fixed(NamedTuple):
-    """A fix after the frame before it; one that ``was_set_aside`` was doubted and never given to the localizer."""
+    """A fix after frame ``number``, which is at or before it; ``t_s`` is its mission time.
 
+    ``fix`` has the time by the robot's clock. One that ``was_set_aside`` was doubted and never given to the localizer.
+    """
+
+    number: int
+    t_s: float
     fix: Fix
     was_fused: bool
     was_set_aside: bool = False
@@ -52,11 +60,20 @@ Event = Marked | Fixed
 Message = Sensors | topics.Rest | topics.FixMessage | topics.Treatment
 
 
-def _fixed(message: topics.FixMessage) -> Fixed:
-    return Fixed(msgspec.convert(message, Fix, from_attributes=True), message.is_fused, message.is_set_aside)
+class Placed(NamedTuple):
+    """A recorded message on the axis of its recording: number and mission time of its frame."""
+
+    number: int
+    t_s: float
+    message: Message
 
 
-def in_order(messages: Iterable[Message]) -> Iterator[Event]:
+def _fixed(number: int, t_s: float, message: topics.FixMessage) -> Fixed:
+    fix = msgspec.convert(message, Fix, from_attributes=True)
+    return Fixed(number, t_s, fix, message.is_fused, message.is_set_aside)
+
+
+def in_order(messages: Iterable[Placed]) -> Iterator[Event]:
     """Frames, rests, treatments and fixes in the order in which the localizer received them.
 
     Frames are recorded in batches; rests and fixes at once, with the number of their frame, so they precede the batch
@@ -66,34 +83,34 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
     rests: set[int] = set()
     treatments: dict[tuple[int, str], tuple[float, ...]] = {}
     is_odometry_off = False
-    fixes: deque[topics.FixMessage] = deque()
+    fixes: deque[Fixed] = deque()
     last = -1
-    for message in messages:
+    for number, t_s, message in messages:
         if isinstance(message, topics.Rest):
-            rests.add(message.seq)
+            rests.add(number)
         elif isinstance(message, topics.FixMessage):
-            fixes.append(message)
+            fixes.append(_fixed(number, t_s, message))
         elif isinstance(message, topics.Treatment):
-            treatments[message.seq, message.kind] = message.values
+            treatments[number, message.kind] = message.values
         else:
-            while fixes and fixes[0].seq < message.seq:
-                yield _fixed(fixes.popleft())
-            last = message.seq
+            while fixes and fixes[0].number < number:
+                yield fixes.popleft()
+            last = number
             begun = treatments.pop((last, "begun"), None)
             if (last, "odometry_off") in treatments or (last, "odometry_on") in treatments or begun is not None:
                 is_odometry_off = (last, "odometry_off") in treatments
             doubted, coasted = treatments.pop((last, "doubted"), None), treatments.pop((last, "coasted"), None)
-            yield Marked(message, last in rests, begun, is_odometry_off, doubted, coasted)
+            yield Marked(number, t_s, message, last in rests, begun, is_odometry_off, doubted, coasted)
             rests.discard(last)
-    while fixes and fixes[0].seq <= last:
-        yield _fixed(fixes.popleft())
+    while fixes and fixes[0].number <= last:
+        yield fixes.popleft()
 
 
 class Trace(NamedTuple):
     """Poses after k frames."""
 
     seq: IntArray  # numbers of the frames, growing, shape (k,)
-    t_s: FloatArray  # robot time, shape (k,)
+    t_s: FloatArray  # mission time, shape (k,)
     pose: FloatArray  # deck x, y (m) and heading (rad), shape (k, 3)
     height_m: FloatArray  # of the surface there, deck frame, shape (k,)
     covariance: FloatArray | None = None  # of ``pose``, shape (k, 3, 3); None where it is not known
@@ -133,14 +150,17 @@ class TraceBuilder:
         """The trace, in the deck frame."""
         names = np.array(self._names, dtype=np.int64).reshape(-1, 3)
         rows = np.array(self._rows).reshape(-1, 4)
-        deck = deck_rows(mirror, names[:, 1:].tolist(), rows[:, 1:])
         covariance = np.array(self._covariances).reshape(-1, 3, 3) if self._covariances else None
+        first = first_of_each(names[:, 0])
+        names, rows, covariance = names[first], rows[first], covariance if covariance is None else covariance[first]
+        deck = deck_rows(mirror, names[:, 1:].tolist(), rows[:, 1:])
         return Trace(names[:, 0], rows[:, 0], deck[:, :3], deck[:, 3], covariance)
 
 
 def trace_of_truth(rows: Sequence[Sequence[float]] | FloatArray) -> Trace:
-    """The simulated truth; rows as in the topic ``truth``."""
+    """The simulated truth; rows as in the topic ``truth``, on the axis of the recording."""
     table = np.asarray(rows, dtype=np.float64).reshape(-1, 11)
+    table = table[first_of_each(table[:, 0])]
     return Trace(table[:, 0].astype(np.int64), table[:, 1], table[:, 2:5], table[:, 7])
 
 
@@ -161,16 +181,29 @@ class Recording:
 
     path: Path
     metadata: Mapping[str, str]
-    # Both are complete when ``messages`` has come to its end.
+    # What was left out. It is complete when ``messages`` has come to its end, as are the arrivals.
     warnings: list[str] = field(default_factory=list)
     arrivals: list[int] = field(default_factory=list)  # frames at which the robot stood at a point for the first time
     _track: TraceBuilder = field(default_factory=TraceBuilder)
     _truth: list[tuple[float, ...]] = field(default_factory=list)
+    _timeline: Timeline | None = None
 
     @property
     def is_simulation(self) -> bool:
         """Robot and laser system were simulated."""
         return self.metadata.get("simulation") == "true"
+
+    @property
+    def timeline(self) -> Timeline:
+        """Numbers and mission times of the frames; ``RunReadError``: the file cannot be read."""
+        if self._timeline is None:
+            self._timeline = _readable(self.path, lambda path: read_timeline(path, is_simulation=self.is_simulation))
+        return self._timeline
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader has to know about the axis: restarts of the robot, steps of its clock."""
+        return [f"{self.path}: {note}" for note in self.timeline.notes]
 
     def config(self, overrides: Mapping[str, object]) -> Config:
         """The recorded configuration with ``overrides``; raises ``ConfigError`` where it cannot be used."""
@@ -184,42 +217,47 @@ class Recording:
             file.write_text(kept, encoding="utf-8")
             return load_config(file, overrides)
 
-    def messages(self) -> Iterator[Message]:
-        """Frames, rests and fixes in the order of recording; estimates and truth are collected on the way."""
-        last, missing, t_s, lost = -1, 0, 0.0, False
-        damages: list[str] = []
-        for topic, _, payload in iter_messages(self.path, damages.append):
+    def messages(self) -> Iterator[Placed]:
+        """Frames, rests and fixes in the order of recording; estimates and truth are collected on the way.
+
+        A frame that was received twice comes twice, as to the localizer.
+        """
+        timeline, lost = self.timeline, list[str]()
+        last_s = float(timeline.t_s[-1]) if len(timeline.t_s) else 0.0
+        self.warnings += [f"{damage}; its last frame is of {last_s:.2f} s" for damage in timeline.damages]
+        if timeline.missing:
+            self.warnings.append(f"{self.path}: {timeline.missing} frames are missing in between")
+        for place, topic, _, payload in iter_places(self.path):
             if topic not in READ:
                 continue
             try:
-                found = self._take(decode_recorded(topic, payload))
+                yield from self._take(timeline, place, decode_recorded(topic, payload))
             except (BadMessage, BadLine) as error:
-                if not lost:  # one line, however many there are
-                    self.warnings.append(f"{self.path}: what cannot be read is left out: {error}")
-                lost = True
-                continue
-            for message in found:
-                if isinstance(message, Sensors):
-                    missing += message.seq - last - 1 if last >= 0 else 0
-                    last, t_s = message.seq, message.t
-                yield message
-        self.warnings += [f"{damage}; its last frame is of {t_s:.2f} s" for damage in damages]
-        if missing:
-            self.warnings.append(f"{self.path}: {missing} frames are missing in between")
+                lost.append(str(error))
+        if lost:
+            what = f"{len(lost)} messages" if len(lost) > 1 else "a message"
+            self.warnings.append(f"{self.path}: what cannot be read is left out: {what}, {lost[0]}")
 
-    def _take(self, message: object) -> list[Message]:
+    def _take(self, timeline: Timeline, place: int, message: object) -> list[Placed]:
         if isinstance(message, topics.SensorLines):
             frames = [decode_from_robot(bytes(line)) for line in message.lines]
-            return [frame for frame in frames if isinstance(frame, Sensors)]
+            read = [frame for frame in frames if isinstance(frame, Sensors)]
+            numbers = timeline.line_numbers(place, [frame.seq for frame in read])
+            times_s = timeline.times(np.array(numbers)).tolist()
+            return [Placed(*row) for row in zip(numbers, times_s, read, strict=True)]
         if isinstance(message, topics.Rest | topics.Treatment | topics.FixMessage):
-            return [message]
-        if isinstance(message, topics.TrackMessage):
-            for seq, t_s, row, col, x_m, y_m, heading_rad, _ in message.rows:
+            number = timeline.number_at(place, message.seq)
+            return [Placed(number, timeline.at(number), message)]
+        if not isinstance(message, topics.TrackMessage | topics.TruthMessage | topics.ArrivalMessage):
+            return []
+        placed = timeline.on_axis(place, message)
+        if isinstance(placed, topics.TrackMessage):
+            for seq, t_s, row, col, x_m, y_m, heading_rad, _ in placed.rows:
                 self._track.add(seq, t_s, row, col, (x_m, y_m, heading_rad))
-        elif isinstance(message, topics.TruthMessage):
-            self._truth += message.rows
-        elif isinstance(message, topics.ArrivalMessage):
-            self.arrivals.append(message.seq)
+        elif isinstance(placed, topics.TruthMessage):
+            self._truth += placed.rows
+        else:
+            self.arrivals.append(placed.seq)
         return []
 
     def recorded(self, mirror: Mirror) -> Trace:

@@ -18,6 +18,7 @@ from ccatp.filters.metrics import Consistency, consistency, rms
 from ccatp.mirror.layout import POINTS_PER_PANEL
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m, distribution, measured_error_m
+from ccatp.records.timeline import common_rows, row_before, rows_of
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, RunRecord
 from ccatp.survey.composition import plan_survey
 from ccatp.survey.fix_gate import nis_of
@@ -26,6 +27,7 @@ from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.planning.search import leg_lengths, leg_time, stop_times
 
 SIGMAS = 3.0
+_FIX_FRAMES = 10  # a fix belongs to the newest estimate, which is at most this much older; the robot stands
 
 
 class Grade(StrEnum):
@@ -94,9 +96,9 @@ def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
             first = {point: 1e3 * measured_error_m(mirror, point, puck_m, height_m) for point, puck_m in pucks.items()}
         elif len(truth.seq):
             frames = {PointId(*arrival.point): arrival.seq for arrival in reversed(session.arrivals)}
-            rows = zip(frames, np.searchsorted(truth.seq, [*frames.values()]).tolist(), frames.values(), strict=True)
-            for point, at, seq in rows:
-                if at < len(truth.seq) and truth.seq[at] == seq:
+            rows = zip(frames, rows_of(truth.seq, [*frames.values()]).tolist(), strict=True)
+            for point, at in rows:
+                if at >= 0:
                     first[point] = 1e3 * arrival_error_m(mirror, point, truth.place[at], height_m)
         found = first | found
     return found
@@ -144,7 +146,7 @@ def error_series(record: RunRecord) -> ErrorSeries | None:
         times.append(track.t_s + offset_s)
         errors = np.full(len(track.seq), np.nan)
         if truth is not None:
-            _, i, j = np.intersect1d(track.seq, truth.seq, assume_unique=True, return_indices=True)
+            i, j = common_rows(track.seq, truth.seq)
             errors[i] = 1e3 * np.linalg.norm(track.place[i] - truth.place[j], axis=1)
         all_errors.append(errors)
         fixes += [(fix.t_s + offset_s, fix.jump_mm, fix.is_fused) for fix in session.fixes]
@@ -202,8 +204,9 @@ def quality_of(record: RunRecord, alignment: SurveyResult | None) -> Quality:
         with suppress(FixRefused):  # what lies far from the mirror was no fix
             known = msgspec.convert(fix, Fix, from_attributes=True)
             foot = deck_foot(record.mirror, known, record.cfg.robot.puck_height_m)
-            at = int(np.searchsorted(session.track.seq, fix.seq, side="right")) - 1
-            if fix.is_fused and at >= 0:
+            at = row_before(session.track.seq, fix.seq)
+            # Where the estimates around a fix are lost, an older one says nothing about it.
+            if fix.is_fused and at >= 0 and fix.seq - session.track.seq[at] <= _FIX_FRAMES:
                 estimate = DeckPose(*session.track.pose[at].tolist())
                 nis.append(nis_of(foot, estimate, session.sigma_m[at] ** 2 * np.eye(2)))
             if fix.is_fused and fix.point is not None:

@@ -336,7 +336,7 @@ class Views:
             return
         point = PointId(*fix.point)
         *_, self._deviations_m[point] = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
-        if fix.t_s - self._points_sent_s >= POINTS_AGAIN_S:
+        if abs(fix.t_s - self._points_sent_s) >= POINTS_AGAIN_S:
             self._points_sent_s = fix.t_s
             yield from self.all_points(fix.t_s)
             return

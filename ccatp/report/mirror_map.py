@@ -164,8 +164,10 @@ def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width_px: flo
     return add_legend(axes)
 
 
-def draw_from_run_dir(run_dir: Path, out: Path) -> None:
+def draw_from_run_dir(run_dir: Path, out: Path) -> tuple[str, ...]:
     """Draw the map of a run into a file, with the distances that the laser system measured.
+
+    Returns what the recording lacks, and what a reader has to know about its times, one line each.
 
     Raises PictureError: the run has no points, or the map cannot be drawn; otherwise as ``read_record``.
     """
@@ -174,6 +176,7 @@ def draw_from_run_dir(run_dir: Path, out: Path) -> None:
         reason = "; ".join(record.warnings) or "no mission.sqlite there, so no points to draw; was the run started?"
         raise PictureError(f"{run_dir}: {reason}")
     plots.save_figure(record_map(record, MAP_WIDTH_PX * PX_PER_IN / MAP_DPI), out, MAP_DPI)
+    return record.warnings
 
 
 def record_map(record: RunRecord, width_px: float) -> Figure:

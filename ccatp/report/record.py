@@ -21,10 +21,11 @@ from ccatp.links.topics import ArrivalMessage, FixMessage, MissionStatus
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.mirror.surface import MirrorError
-from ccatp.records.recorder import TELEMETRY, damage_text, decode_recorded, iter_messages, read_metadata, recordings
+from ccatp.records.recorder import TELEMETRY, damage_text, decode_recorded, read_metadata, recordings
 from ccatp.records.run_reader import CONFIG, STORE, RunReadError, Trace, check_run_dir, read_truth, trace_of_truth
 from ccatp.records.state_log import LogLine, StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint, StoreError, read_survey
+from ccatp.records.timeline import Timeline, first_of_each, iter_places, read_timeline
 
 COMPLETE = "complete"
 WITHIN_MM = 10.0  # the thesis's requirement on arrivals
@@ -34,7 +35,10 @@ TOPICS_READ = frozenset(("track", "truth", "arrival", "fix", "mission"))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedSession:
-    """One recording; a run that was resumed has several."""
+    """One recording; a run that was resumed has several.
+
+    Frames and times of all its parts are on the axis of the recording, see ``ccatp.records.timeline``.
+    """
 
     name: str
     version: str
@@ -48,7 +52,7 @@ class RecordedSession:
 
     @property
     def span_s(self) -> float:
-        """Robot time from the first frame to the last one."""
+        """Mission time from the first frame to the last one."""
         return float(self.track.t_s[-1] - self.track.t_s[0]) if len(self.track.t_s) else 0.0
 
 
@@ -117,8 +121,9 @@ def read_record(run_dir: Path) -> RunRecord:
     folder = RunFolder(run_dir, "log of the processes, and when the mission changed its state")
     found = folder.recordings(TOPICS_READ, _COLUMNS, "path, estimates, arrivals and fixes over time")
     all_changes = changes_of(folder.log, len(found))
+    # The log names frames by the robot's own numbers, which are those of the axis until it restarts.
     sessions = [
-        _session(one, mirror, changes, folder.warnings)
+        _session(one, mirror, () if one.timeline.has_restart else changes, folder.warnings)
         for one, changes in zip(found, all_changes, strict=True)
         if one is not None
     ]
@@ -167,11 +172,12 @@ def changed_keys(
 
 
 class Recording(NamedTuple):
-    """The messages of a recording by topic, and its metadata."""
+    """The messages of a recording by topic, on its axis, and its metadata."""
 
     name: str
     messages: dict[str, list[Any]]
     version: str
+    timeline: Timeline
 
 
 class RunFolder:
@@ -216,7 +222,7 @@ class RunFolder:
         return None
 
     def recordings(self, topics: Iterable[str], columns: Mapping[str, int], holds: str) -> list[Recording | None]:
-        """All recordings, each up to its end or its first damage; None in place of an unreadable one.
+        """All recordings, without their damaged parts; None in place of an unreadable one.
 
         Messages of topics in ``columns`` are tables and become arrays of shape (k, columns).
         """
@@ -227,14 +233,15 @@ class RunFolder:
 
     def _recording(self, path: Path, topics: Iterable[str], columns: Mapping[str, int]) -> Recording | None:
         found: dict[str, list[Any]] = {topic: [] for topic in topics}
-        damages, lost = list[str](), list[str]()
+        lost = list[str]()
         try:
             metadata = read_metadata(path)
-            for topic, _, payload in iter_messages(path, damages.append):
+            timeline = read_timeline(path, is_simulation=metadata.get("simulation") == "true")
+            for place, topic, _, payload in iter_places(path):
                 if topic not in found:
                     continue
                 try:
-                    message: Any = decode_recorded(topic, payload)
+                    message: Any = timeline.on_axis(place, decode_recorded(topic, payload))
                     if topic in columns:
                         message = np.array(message.rows, dtype=np.float64).reshape(-1, columns[topic])
                     found[topic].append(message)
@@ -243,20 +250,22 @@ class RunFolder:
         except OSError as error:
             self.warnings.append(f"{path.name}: cannot be read: {error.strerror or error}")
             return None
-        self.warnings += [damage_text(path, damage) for damage in damages]
+        self.warnings += [damage_text(path, damage) for damage in timeline.damages]
+        self.warnings += [f"{path.name}: {note}" for note in timeline.notes]
+        if timeline.missing:
+            self.warnings.append(f"{path.name}: {timeline.missing} frames are missing in between")
         if lost:
             self.warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are left out: {lost[0]}")
         if (mark := metadata.get("simulation")) is not None:
             self.is_simulation = mark == "true"
-        return Recording(path.name, found, metadata.get("ccatp", "unknown"))
+        return Recording(path.name, found, metadata.get("ccatp", "unknown"), timeline)
 
 
 def joined(batches: Sequence[FloatArray], columns: int, needed: int) -> FloatArray:
     """One table with increasing and unique frames, without rows whose first ``needed`` columns are not finite."""
     rows = np.concatenate(batches) if batches else np.empty((0, columns))
     rows = rows[np.isfinite(rows[:, :needed]).all(axis=1)]
-    _, first = np.unique(rows[:, 0], return_index=True)
-    return np.asarray(rows[first])
+    return np.asarray(rows[first_of_each(rows[:, 0])])
 
 
 _COLUMNS = {"track": 8, "truth": 11}

@@ -3,7 +3,7 @@
 import os
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from struct import Struct
 from typing import Any
@@ -59,6 +59,7 @@ class SurveyTruth(TruthSource):
     world: World
     seq: int
     t_s: float
+    boots: Sequence[int] = (0,)  # ``seq`` before the first frame of each boot
 
     @property
     def truth_requests(self) -> Mapping[str, Callable[[], dict[str, object]]]:
@@ -80,7 +81,7 @@ class SurveyTruth(TruthSource):
         return self.world.truth_row(self.seq, self.t_s)
 
     def truth_message(self, rows: list[TruthRow]) -> tuple[str, TruthMessage]:
-        return "truth", TruthMessage(seq=self.seq, t_s=self.t_s, rows=rows)
+        return "truth", TruthMessage(seq=self.seq, t_s=self.t_s, rows=rows, boots=[*self.boots])
 
     def truth_preface(self) -> tuple[str, Misalignment]:
         return "misalignment", Misalignment(seq=self.seq, t_s=self.t_s, panels=self._panels())

@@ -102,6 +102,7 @@ class Robot(LinkedRobot, SurveyTruth):
         health = self.fans.health
         self.reboots += 1
         self.boot_count += not keeps_number
+        self.boots = *self.boots, self.seq
         self._boot()
         self.fans.health = health
         self._frames.clear()

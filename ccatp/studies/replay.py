@@ -23,6 +23,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
 from ccatp.records.run_reader import Event, Fixed, Marked, Trace, TraceBuilder
 from ccatp.records.summary import distribution
+from ccatp.records.timeline import common_rows, rows_of
 from ccatp.report.html import render
 from ccatp.studies.results import value_at
 
@@ -193,7 +194,7 @@ def replay(
 ) -> Replayed:  # fmt: skip
     """Run the localizer of a configuration over the events of a run, from its start at base.
 
-    ``smooth``: only if ``has_smoother``. ``on_frame`` gets the robot time of each frame, s. Raises FilterError: the
+    ``smooth``: only if ``has_smoother``. ``on_frame`` gets the mission time of each frame, s. Raises FilterError: the
     smoothed state is not finite, or the main loop was restarted within a run that is to be smoothed.
     """
     player = _Player(cfg, mirror, smooth)
@@ -203,7 +204,7 @@ def replay(
         else:
             player.take_frame(event)
             if on_frame is not None:
-                on_frame(event.sensors.t)
+                on_frame(event.t_s)
     return player.result()
 
 
@@ -244,11 +245,13 @@ class _Player:
             localizer.inflate_covariance(*event.doubted)
         if event.at_rest:
             localizer.rest()
-        self._seq = sensors.seq
+        if event.number <= self._seq:
+            return  # received again
+        self._seq = event.number
         if any(abs(right or 0.0) > TURNING_RAD_S or abs(left or 0.0) > TURNING_RAD_S for _, right, left in sensors.enc):
-            self._moving.append(sensors.seq)
+            self._moving.append(event.number)
         here = localizer.pose
-        self._builder.add(sensors.seq, sensors.t, *here.panel, (here.x_m, here.y_m, here.heading_rad))
+        self._builder.add(event.number, event.t_s, *here.panel, (here.x_m, here.y_m, here.heading_rad))
         self._builder.add_covariance(localizer.pose_covariance)
         if self._recording is not None:
             self._steps.append(self._recording.count)
@@ -267,7 +270,7 @@ class _Player:
             said = str(refusal)
             self._fates["refused"] += 1
         if bool(said) is event.was_fused and self._first is None:
-            self._first = event.fix.t_s, said
+            self._first = event.t_s, said
         if event.was_fused:
             with suppress(MirrorError):
                 x, y, _ = self._mirror.foot_of_puck(event.fix.position_m, self._cfg.robot.puck_height_m)
@@ -308,7 +311,8 @@ class ReplayErrors(NamedTuple):
 
 def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: ArrayLike) -> ReplayErrors:
     """Compare in the common frames; ``arrivals``: frames at which the robot stood at a point for the first time."""
-    seqs, i, j = np.intersect1d(estimate.seq, reference.seq, return_indices=True)
+    i, j = common_rows(estimate.seq, reference.seq)
+    seqs = estimate.seq[i]
     offset = estimate.place[i] - reference.place[j]
     turn = estimate.pose[i, 2] - reference.pose[j, 2]
     turn = turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi))  # exactly zero for equal angles
@@ -383,8 +387,10 @@ def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
         each = []
         for part, estimate in zip(parts, estimates, strict=True):
             seq, x, y = part.replayed.feet.T
-            places = estimate.place[np.searchsorted(estimate.seq, seq)]
-            each.append(places - np.column_stack([x, y, part.mirror.surface.heights_m(x, y)]))
+            rows = rows_of(estimate.seq, seq)
+            known = rows >= 0  # an estimate may be lost
+            feet = np.column_stack([x, y, part.mirror.surface.heights_m(x, y)])
+            each.append(estimate.place[rows[known]] - feet[known])
         return distribution(1e3 * np.linalg.norm(np.concatenate(each), axis=1), _FIGURES, decimals=_DECIMALS)
 
     return {

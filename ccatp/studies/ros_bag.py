@@ -24,8 +24,9 @@ from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import DangerEvent, FixMessage, MissionStatus, SensorLines, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror
-from ccatp.records.recorder import decode_recorded, iter_logged
+from ccatp.records.recorder import decode_recorded
 from ccatp.records.run_reader import Event, Fixed, Recording, in_order
+from ccatp.records.timeline import Timeline, iter_places
 from ccatp.report.foxglove import deck_in_world, quaternion
 from ccatp.studies.replay import replay
 
@@ -58,7 +59,8 @@ def write_bag(folder: Path, recording: Recording, cfg: Config, mirror: Mirror) -
     motions: dict[int, _Motion] = {}
     trace = replay(cfg, mirror, _with_motions(in_order(recording.messages()), cfg, motions)).trace
     covariances = {} if trace.covariance is None else dict(zip(trace.seq.tolist(), trace.covariance, strict=True))
-    export, types = _Export(cfg, mirror, covariances, motions), get_typestore(Stores.ROS2_JAZZY)
+    timeline, types = recording.timeline, get_typestore(Stores.ROS2_JAZZY)
+    export = _Export(cfg, mirror, timeline, covariances, motions)
     connections: dict[str, Connection] = {}
     writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)  # which ROS 2 Humble and later read
     writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -85,49 +87,59 @@ def _with_motions(events: Iterable[Event], cfg: Config, motions: dict[int, _Moti
             of_wheel = (robot.wheel_radius_m * noise.encoder_sigma_rad_s) ** 2 / len(rates)
             along, across = (slip * twist.v_m_s) ** 2, (unequal * twist.v_m_s) ** 2
             of_rate = (across + 2.0 * of_wheel) / robot.wheel_base_m**2
-            motions[event.sensors.seq] = twist.v_m_s, twist.omega_rad_s, along + 0.5 * of_wheel, of_rate
+            motions[event.number] = twist.v_m_s, twist.omega_rad_s, along + 0.5 * of_wheel, of_rate
         yield event
 
 
-Stamped = tuple[str, float, Any]  # topic, robot time (s), message
+Stamped = tuple[str, float, Any]  # topic, mission time (s), message
 
 
 class _Export:
     """Converts the messages of one recording."""
 
     def __init__(
-        self, cfg: Config, mirror: Mirror, covariances: Mapping[int, FloatArray], motions: Mapping[int, _Motion]
+        self,
+        cfg: Config,
+        mirror: Mirror,
+        timeline: Timeline,
+        covariances: Mapping[int, FloatArray],
+        motions: Mapping[int, _Motion],
     ) -> None:
         self._cfg, self._mirror, self._covariances, self._motions = cfg, mirror, covariances, motions
-        self._utc_offset_ns = 0
+        self._timeline, self._left_out = timeline, 0
+        self._newest = -1  # number of the newest frame that is written
 
     def messages(self, recording: Recording) -> Iterator[tuple[str, int, Any]]:
         """Topic, stamp (ns) and message, in the order of recording."""
         converted: dict[str, Callable[[Any], Iterator[Stamped]]] = {
-            "sensors": self._of_lines,
             "track": self._of_track,
             "truth": self._of_truth,
             "fix": self._of_fix,
             "mission": self._of_mission,
             "danger_event": self._of_danger,
         }
-        has_utc, has_begun = True, False
-        for utc_offset_ns, (name, begin_s, payload) in iter_logged(recording.path):
-            if name not in converted:
+        has_begun, timeline = False, self._timeline
+        for place, name, _, payload in iter_places(recording.path):
+            if name not in converted and name != "sensors":
                 continue
-            self._utc_offset_ns, has_utc = utc_offset_ns or 0, has_utc and utc_offset_ns is not None
-            if not has_begun:
-                has_begun = True
-                fixed = ros.tf2_msgs__msg__TFMessage([*self._fixed_frames(begin_s)])
-                yield "/tf_static", self._ns(begin_s), fixed
             with suppress(BadMessage, BadLine):  # already reported by the replay
-                for topic, t_s, message in converted[name](decode_recorded(name, payload)):
-                    yield topic, self._ns(t_s), message
-        if not has_utc:
+                message = timeline.on_axis(place, decode_recorded(name, payload))
+                if not has_begun:
+                    has_begun = True
+                    fixed = ros.tf2_msgs__msg__TFMessage([*self._fixed_frames(message.t_s)])
+                    yield "/tf_static", self._ns(message.t_s), fixed
+                found = self._of_lines(place, message) if name == "sensors" else converted[name](message)
+                for topic, t_s, sample in found:
+                    yield topic, self._ns(t_s), sample
+        if timeline.utc_ns(0.0) is None:
             recording.warnings.append(f"{recording.path}: an older format without UTC; stamps are of the robot's clock")
+        if self._left_out:
+            what = f"{self._left_out} samples have times that cannot be, and are left out"
+            recording.warnings.append(f"{recording.path}: {what}")
 
     def _ns(self, t_s: float) -> int:
-        return round(t_s * _NS) + self._utc_offset_ns
+        utc_ns = self._timeline.utc_ns(t_s)
+        return round(t_s * _NS) if utc_ns is None else utc_ns
 
     def _header(self, t_s: float, frame: str) -> Any:
         return ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(*divmod(self._ns(t_s), _NS)), frame)
@@ -145,28 +157,43 @@ class _Export:
         for name, place in links.items():
             yield self._transform(t_s, BASE_LINK, name, place)
 
-    def _of_lines(self, message: SensorLines) -> Iterator[Stamped]:
+    def _of_lines(self, place: int, message: SensorLines) -> Iterator[Stamped]:
         noise, none = self._cfg.localizer, np.empty(0)
         of_rate = np.diag((NOT_MEASURED, NOT_MEASURED, noise.gyroscope_sigma_rad_s**2)).ravel()
         ahead = np.diag((noise.accelerometer_sigma_m_s2**2, NOT_MEASURED, NOT_MEASURED)).ravel()
         no_orientation = np.array([-1.0, *[0.0] * 8])  # "not measured", by the definition of the message
-        for frame in [decode_from_robot(bytes(line)) for line in message.lines]:
-            if not isinstance(frame, Sensors):
-                continue
-            for t_s, ax_m_s2, wz_rad_s in frame.imu:
+        read = [decode_from_robot(bytes(line)) for line in message.lines]
+        frames = [frame for frame in read if isinstance(frame, Sensors)]
+        numbers = self._timeline.line_numbers(place, [frame.seq for frame in frames])
+        for number, frame in zip(numbers, frames, strict=True):
+            if number <= self._newest:
+                continue  # received again
+            self._newest = number
+            for sample_s, ax_m_s2, wz_rad_s in frame.imu:
+                t_s = self._sample_s(number, frame.t, sample_s)
+                if t_s is None:
+                    continue
                 rate, acceleration = _Vector(0.0, 0.0, wz_rad_s), _Vector(ax_m_s2, 0.0, 0.0)
                 header, of_turn = self._header(t_s, IMU_LINK), (_UPRIGHT, no_orientation)
                 yield "/imu", t_s, ros.sensor_msgs__msg__Imu(header, *of_turn, rate, of_rate, acceleration, ahead)
-            for t_s, *rates_rad_s in frame.enc:
+            for sample_s, *rates_rad_s in frame.enc:
+                t_s = self._sample_s(number, frame.t, sample_s)
+                if t_s is None:
+                    continue
                 velocity = np.array([nan if rate is None else rate for rate in rates_rad_s])
                 wheels = ros.sensor_msgs__msg__JointState(self._header(t_s, ""), WHEELS, none, velocity, none)
                 yield "/joint_states", t_s, wheels
 
+    def _sample_s(self, number: int, frame_s: float, sample_s: float) -> float | None:
+        t_s = self._timeline.sample_s(number, frame_s, sample_s)
+        self._left_out += t_s is None
+        return t_s
+
     def _of_track(self, message: TrackMessage) -> Iterator[Stamped]:
         unknown = np.diag([NOT_MEASURED] * 3)
-        for seq, t_s, row, col, x_m, y_m, heading_rad, _ in message.rows:
+        for number, t_s, row, col, x_m, y_m, heading_rad, _ in message.rows:
             pose = self._mirror.deck_pose(PanelPose(PanelId(row, col), x_m, y_m, heading_rad))
-            covariance, motion = self._covariances.get(seq, unknown), self._motions.get(seq, _UNKNOWN)
+            covariance, motion = self._covariances.get(number, unknown), self._motions.get(number, _UNKNOWN)
             odometry = self._odometry(t_s, pose, covariance, motion)
             yield "/odom", t_s, odometry
             here = odometry.pose.pose

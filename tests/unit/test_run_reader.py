@@ -75,10 +75,10 @@ def test_what_a_recording_holds(tmp_path: Path, config_text: str) -> None:
     )
     (recording,) = open_run(tmp_path)
     found = list(recording.messages())
-    assert isinstance(found[0], Rest)
-    assert [message.seq for message in found] == [1, 0, 1]
-    assert isinstance(found[2], Sensors)
-    assert found[2].imu[0].t_s == 0.01
+    assert isinstance(found[0].message, Rest)
+    assert [(one.number, one.t_s) for one in found] == [(1, 0.01), (0, 0.0), (1, 0.01)]
+    assert isinstance(found[2].message, Sensors)
+    assert found[2].message.imu[0].t_s == 0.01
     cfg = recording.config({})
     assert (cfg.run.seed, cfg.run.filter) == (5, "kf")
     assert recording.recorded(build_mirror(cfg.mirror)).seq.tolist() == [0, 1]
@@ -129,7 +129,7 @@ def test_a_torn_file_is_read_up_to_its_damage(tmp_path: Path, config_text: str) 
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     (recording,) = open_run(tmp_path)
-    frames = [message.seq for message in recording.messages()]
+    frames = [one.number for one in recording.messages()]
     assert frames == list(range(len(frames)))
     assert 100 <= len(frames) < 3000
     (warning,) = recording.warnings

@@ -58,7 +58,7 @@ class CalibrationDrive(SilRun):
         """As the calibration takes it."""
         builder, fixes = DriveBuilder(self.mirror, self.cfg.robot.puck_height_m), list(self.fixes)
         for frame in self.frames:
-            builder.frame(frame)
+            builder.frame(frame.seq, frame)
             while fixes and fixes[0][0] == frame.seq:
                 builder.fix(fixes.pop(0)[1])
         return builder.build()
@@ -108,16 +108,16 @@ def test_a_second_fix_at_a_place_drops_the_rest_between_them(driven: Calibration
     stop = next(k for k, frame in enumerate(frames) if frame.seq == seq)
     end = next(k for k, frame in enumerate(frames) if frame.seq == driven.fixes[1][0])
     for rest in range(stop + 1):
-        builder.frame(frames[rest])
+        builder.frame(frames[rest].seq, frames[rest])
     for seconds in range(3):  # measured again while it stands
         for k in range(100):
             t_s, number = frames[stop].t + seconds + 0.01 * (k + 1), seq + 100 * seconds + k + 1
             still = [WheelSample(t_s - 0.01 + 0.001 * (j + 1), 0.0, 0.0) for j in range(10)]
-            builder.frame(msgspec.structs.replace(frames[stop], seq=number, t=t_s, enc=still, imu=[]))
+            builder.frame(number, msgspec.structs.replace(frames[stop], seq=number, t=t_s, enc=still, imu=[]))
         builder.fix(fix)
     for frame in frames[stop + 1 : end + 1]:
         t_s, samples = frame.t + 3.0, [row._replace(t_s=row.t_s + 3.0) for row in frame.enc]
-        builder.frame(msgspec.structs.replace(frame, seq=frame.seq + 300, t=t_s, enc=samples))
+        builder.frame(frame.seq + 300, msgspec.structs.replace(frame, seq=frame.seq + 300, t=t_s, enc=samples))
     builder.fix(driven.fixes[1][1])
     (segment,) = builder.build().segments
     assert len(segment.right_rad) == end - stop

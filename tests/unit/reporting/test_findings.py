@@ -150,7 +150,7 @@ def test_a_run_that_was_killed(without: Callable[..., Path]) -> None:
     assert found.missing == ("summary.json: the run goes on, or was killed before its end",)
     torn, line = sorted(found.warnings, reverse=True)
     assert torn.startswith("telemetry.mcap: damaged or cut off at byte ")
-    assert torn.endswith("; what came before it is in this report")
+    assert torn.endswith("; the rest is in this report")
     assert line == "log.jsonl: 1 lines cannot be read and are left out"
     assert len(only(found).track.seq) > 500
     ended = findings_of(found).outcome

@@ -186,7 +186,7 @@ def mirror(recording: Recording) -> Mirror:
 
 @pytest.fixture(scope="module")
 def frames(recording: Recording) -> list[Sensors]:
-    return [message for message in recording.messages() if isinstance(message, Sensors)]
+    return [one.message for one in recording.messages() if isinstance(one.message, Sensors)]
 
 
 @pytest.fixture(scope="module")
