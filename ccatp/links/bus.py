@@ -386,7 +386,9 @@ class Telemetry:
 
     def continue_numbering(self) -> None:
         """The robot's frames restarted: the recorded numbers continue after the newest known frame."""
+        self.flush()
         self.frames_before += max(self.seq, 0)
+        self.seq = -1  # it may restart again before its first frame
 
     def begin_session(self, boot: int, session: int) -> None:
         """Record which frames come from now on; batches do not go over it."""

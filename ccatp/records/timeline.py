@@ -200,7 +200,7 @@ class Timeline:
             return -1
         if seq < 0:  # no frame since the robot restarted
             later = [start for start in self._starts if at <= start < at + NEAR_FRAMES]
-            return int(self._number[later[0] if later else at - 1])
+            return int(self._number[(later[0] if later else at) - 1])
         until = bisect_right(self._session_places, place)
         if until < len(self._session_places):  # frames of a later session do not belong to this message
             ends = bisect_left(self._places, self._session_places[until])

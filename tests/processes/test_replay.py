@@ -59,6 +59,55 @@ def test_the_same_filter_reproduces_the_run(recorded_run: RecordedRun, capsys: p
     assert recording.config({}) == load_config(recorded_run.run_dir / "config.toml")
 
 
+RESTARTS = """
+[[fault]]
+signal = "robot"
+type = "reboot"
+at_s = 25.0
+
+[[fault]]
+signal = "clock"
+type = "jump"
+at_s = 40.0
+by_s = -5.0
+
+[[fault]]
+signal = "clock"
+type = "wrap"
+at_s = 60.0
+modulo_s = 30.0
+
+[[fault]]
+signal = "robot"
+type = "reboot"
+at_s = 70.0
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.fault("P25")
+def test_a_run_with_restarts_and_steps_of_the_clock_is_read_as_it_was(
+    start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str], measured: Measured
+) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text(RESTARTS, encoding="utf-8")
+    run = start("--panels", "1", "--faults", str(plan), calibrates=True)
+    assert run.wait() == 0, run.stderr
+    status = main(["replay", str(run.run_dir), "--json"])
+    printed = capsys.readouterr()
+    assert status == 0, printed.err
+    result, summary = json.loads(printed.out), run.summary["localization_error_mm"]
+    assert result["difference"]["reproduced"]
+    for name in ("mean", "p50", "p99", "max"):
+        assert result["recorded"]["position_error_mm"][name] == pytest.approx(summary[name], abs=2e-3)
+    (recording,) = open_run(run.run_dir)
+    assert sum(step.kind == "restart" for step in recording.timeline.steps) == 2
+    assert (np.diff(recording.timeline.t_s) > 0.0).all()
+    frames = int(recording.timeline.number[-1])
+    assert recording.timeline.t_s[-1] == pytest.approx(0.01 * frames, abs=1e-6)
+    measured("P25", 0 if result["difference"]["reproduced"] else 1)
+
+
 def test_its_panels_lie_as_they_were_simulated(recorded_run: RecordedRun, capsys: pytest.CaptureFixture[str]) -> None:
     result = result_of(capsys, "align", recorded_run.run_dir)
     assert (len(result["panels"]), result["points"]["measured"]) == (2, 18)

@@ -67,7 +67,19 @@ def test_recorded_numbers_go_on_where_the_robot_begins_anew(telemetry: Telemetry
     assert telemetry.frames_before == 0
     telemetry.add_frame(41, 1.0, b"{}", row(41))
     telemetry.continue_numbering()
+    telemetry.continue_numbering()  # again before its first frame
     assert telemetry.frames_before == 41
+
+
+def test_a_session_is_recorded_between_the_batches_of_its_neighbours(telemetry: Telemetry, received: Received) -> None:
+    telemetry.begin_session(6, 1)
+    telemetry.add_frame(41, 1.0, b"{}", row(41))
+    telemetry.continue_numbering()
+    telemetry.begin_session(7, 3)
+    first, second = received["session"]
+    assert (first.boot, first.session, first.frames_before) == (6, 1, 0)
+    assert (second.boot, second.session, second.frames_before) == (7, 3, 41)
+    assert [(batch.seq, len(batch.lines)) for batch in received["sensors"]] == [(41, 1)]
 
 
 # -- a robot that stands still -----------------------------------------------------------------------------------------
