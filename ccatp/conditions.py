@@ -440,6 +440,16 @@ FRAME_REFUSED = fault(Group.SURVEY, "the laser system sees the robot {distance_m
 LASER_NOT_READY = wait(Group.SURVEY, "the laser system is not ready (laserready_0)",
     "Its lasers are not warm. The robot waits at its point; no point is skipped.",
     "Wait, or look at the laser unit; `ccatp check` shows it as well.")
+LASER_NOT_FOLLOWING = fault(Group.SURVEY,
+    "the laser does not follow the robot: its fixes of {count} standstills agree, and encoders and gyroscope moved",
+    "The lengths are those of one place (with noise) while wheels and gyroscope show motion: the laser measures "
+    "another reflector or delivers old lengths. None of these fixes is used.",
+    "Point the beams at the puck or restart the laser's driver; then `ccatp resume`: it takes a fix. `ccatp abort` "
+    "sends the robot home by odometry.")
+METROLOGY_UNRELIABLE = inform(Group.SURVEY,
+    "the lengths of {count} points in a row contradict each other: channels {channels}",
+    "The fixes navigate the robot, but are no measurement of the panels: these points are marked unreliable.",
+    "Check the beams, the reflector and the air data of the laser system. Measure the points again.")
 LENGTHS_REFUSED = fault(Group.SURVEY, "the laser system's lengths do not lead to the robot's base: {why}",
     "The lengths of the first fix give no position.", "Check the configured collimators and base.")
 FILTER_DIVERGED = hold(Group.SURVEY, "filter: {why}",

@@ -105,7 +105,14 @@ class DeckPose(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A multilaterated position of the puck, world frame; covariance 3 x 3, row-major; DOP sqrt(trace((J^T J)^-1))."""
+    """A multilaterated position of the puck, world frame; covariance 3 x 3, row-major; DOP sqrt(trace((J^T J)^-1)).
+
+    ``covariance_m2`` includes what lengths that contradict each other leave open. ``lengths_m``: of ``channels``, then
+    of ``left_out``. ``metrology``: ``good``, ``unchecked``, ``unreliable``, or empty if it was not judged.
+    ``suspects``: channels that contradict each other. ``detectable_m``: error of a length that is detected with
+    probability 0.999; ``protection_m``: error of the position by a smaller one, with the noise.
+    ``warnings``: for operators.
+    """
 
     t_s: float
     position_m: Vector3
@@ -113,6 +120,13 @@ class Fix:
     dop: float
     channels: tuple[int, ...]
     residual_rms_m: float
+    left_out: tuple[int, ...] = ()
+    lengths_m: tuple[float, ...] = ()
+    metrology: str = ""
+    suspects: tuple[int, ...] = ()
+    detectable_m: float | None = None
+    protection_m: float | None = None
+    warnings: tuple[str, ...] = ()
 
 
 class EventCode(IntEnum):

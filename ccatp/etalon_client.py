@@ -18,7 +18,8 @@ from ccatp.core import Fix, Vector3
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.links import multiline
 from ccatp.links.multiline import ChannelData, Command, Connected, Environment, LaserReady, MultilineRequest, Remark
-from ccatp.mirror.multilateration import MultilaterationError, solve_fix
+from ccatp.mirror.fix_judgement import FixJudge
+from ccatp.mirror.multilateration import MultilaterationError
 
 
 class EtalonError(CcatpError):
@@ -96,6 +97,7 @@ class EtalonClient:
         self._where = f"Etalon server {cfg.host}:{cfg.port}"
         self._channels = tuple(channels)
         self._collimators = dict(zip(self._channels, np.asarray(collimators_m, dtype=np.float64), strict=True))
+        self._judge = FixJudge(cfg, self._collimators)
         self._request = MultilineRequest(Command.LATEST_LENGTH_VALID, self._channels)
         self._connection: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._turn = asyncio.Lock()
@@ -233,8 +235,8 @@ class EtalonClient:
             )
         self._refuse_old(lengths_m, expected_m)
         try:
-            fix = solve_fix(self._cfg, t_s, expected_m, lengths_m, self._collimators)
-        except MultilaterationError as error:
+            fix = self._judge.fix(t_s, expected_m, lengths_m)
+        except (MultilaterationError, ValueError) as error:  # numbers without a solution
             raise BadSolution(
                 f"{self._where}: {error}; channels {valid}: check beams, collimators and [etalon] limits", lengths_m
             ) from error

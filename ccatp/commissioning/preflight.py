@@ -15,6 +15,7 @@ from ccatp.control.thrust import forecast_grip
 from ccatp.core import Fix
 from ccatp.links.multiline import Environment
 from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.mirror.length_integrity import UNCHECKED, UNRELIABLE
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.report.html import render
@@ -114,7 +115,18 @@ def check_fix(cfg: Config, mirror: Mirror, fix: Fix) -> PreflightResult:
         return failed(found, "set the robot down at base; else frame or unit of the collimators is wrong")
     if abs(deviation_m) > cfg.etalon.max_surface_residual_m:
         return failed(found, "robot.puck_height_m or the collimators' positions are wrong")
+    todo = "check beams, reflector and air data of the laser system; its points would be no measurements"
+    if fix.metrology == UNRELIABLE:
+        return warned(f"{found}; the lengths contradict each other: channels {_listed(fix.suspects)}", todo)
+    if fix.left_out:
+        return warned(f"{found}; left out: channels {_listed(fix.left_out)}", "check the beam of that channel")
+    if fix.metrology == UNCHECKED:
+        return warned(f"{found}; too few lengths to contradict each other", "clear the beams of the other channels")
     return passed(found)
+
+
+def _listed(channels: Iterable[int]) -> str:
+    return " ".join(map(str, channels))
 
 
 EDGES = ("front left", "front right", "rear left", "rear right")

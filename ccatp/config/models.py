@@ -243,6 +243,11 @@ class EtalonConfig(Model):
     measuring_time_s: Positive
     length_sigma_m: Positive
     length_sigma_per_m: NonNegative
+    collimator_sigma_m: NonNegative
+    offset_sigma_m: NonNegative
+    refraction_sigma: NonNegative
+    false_alarm: Annotated[float, Field(gt=0.0, lt=0.5)]
+    alarm_points: Annotated[int, Field(ge=1, le=1000)]
     max_residual_m: Positive
     max_dop: Positive
     max_distance_m: Positive

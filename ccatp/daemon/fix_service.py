@@ -7,7 +7,14 @@ from dataclasses import asdict, dataclass
 from math import inf
 from typing import Any
 
-from ccatp.conditions import DISK_STALLS, FIX_NOT_STORED, LASER_NOT_READY, SKIP_NOT_STORED
+from ccatp.conditions import (
+    DISK_STALLS,
+    FIX_NOT_STORED,
+    LASER_NOT_FOLLOWING,
+    LASER_NOT_READY,
+    METROLOGY_UNRELIABLE,
+    SKIP_NOT_STORED,
+)
 from ccatp.config.models import MissionConfig
 from ccatp.core import DeckPose, Fix, PointId, Vector3
 from ccatp.estimation.fixes import FixRefused
@@ -15,9 +22,11 @@ from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry
 from ccatp.links.topics import FixMessage
 from ccatp.localizer import Localizer
+from ccatp.mirror.length_integrity import UNRELIABLE
 from ccatp.records.store import AlreadyMeasuredError, MissionStore, StoreError
 from ccatp.survey.events import Fault, FixFailed, FixStored, PointMissed
 from ccatp.survey.fix_gate import ApproachCounter, FixGate
+from ccatp.survey.laser_follow import LaserFollow
 from ccatp.survey.statechart import Mission
 
 # A commit takes milliseconds, or a second on a busy disk. After these times it is reported, then holds the robot.
@@ -31,6 +40,10 @@ REPEATS = 2
 
 class FrameRefused(EtalonError):
     """The laser system measures in another frame or unit, and cannot be used in this mission."""
+
+
+class LaserStuck(EtalonError):
+    """The fixes stay at one place while the robot moves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +76,10 @@ class FixService:
         on_finished: Callable[[], None],
         between_s: Callable[[], float],
         heading_sigma_of: Callable[[], float] = float,
+        follow: LaserFollow | None = None,
+        alarm_points: int = 3,
     ) -> None:
+        self._follow, self._alarm_points, self._unreliable = follow, alarm_points, 0
         self._tolerance_m = cfg.arrival_tolerance_m
         self._approaches = ApproachCounter(cfg.correction_tolerance_m, cfg.max_approaches)
         self._client, self._localizer, self._mission = client, localizer, mission
@@ -74,6 +90,7 @@ class FixService:
         self._wakes = asyncio.Event()
         self.is_busy = False  # from ``begin`` to the end of the measurement
         self.arrival_error_m = 0.0  # distance of the last fix from its point
+        self.metrology_cause = ""  # why the last points are no measurements, or empty
         self.wait_cause = ""  # what the measurement waits for, or empty
 
     def begin(self, request: FixRequest) -> None:
@@ -102,6 +119,8 @@ class FixService:
     async def _serve(self, request: FixRequest) -> None:
         """Measure, and repeat a doubtful fix, within the time limit of a point."""
         self._fix_gate.begin()
+        if self._follow is not None:
+            self._follow.begin()
         try:
             await self._await_laser(request)
             async with asyncio.timeout(self._timeout_s):
@@ -136,6 +155,8 @@ class FixService:
     async def _measure(self, request: FixRequest) -> tuple[Fix, str]:
         """Measure a fix, and fuse it if it is still wanted; returns it, and why it is doubted or an empty text."""
         fix = await self._client.measure(request.t_s, request.expected_m)
+        for warning in fix.warnings:
+            self._notify("warning", f"{_name(request.point)}: {warning}")
         return fix, self._fuse(request, fix) if self._is_wanted(request) else ""
 
     def _fuse(self, request: FixRequest, fix: Fix) -> str:
@@ -144,7 +165,8 @@ class FixService:
         finding = self._fix_gate.review(
             fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.state.is_lost
         )
-        doubt, jump_m = finding.doubt or finding.refusal, 0.0
+        stuck = "" if self._follow is None else self._follow.doubt(fix)
+        doubt, jump_m = finding.doubt or finding.refusal or stuck, 0.0
         is_set_aside = bool(doubt)
         if not is_set_aside:
             try:
@@ -162,6 +184,8 @@ class FixService:
         self._telemetry.send("fix", message)
         if finding.refusal:
             raise FrameRefused(finding.refusal)
+        if stuck and self._follow is not None and self._follow.is_certain:
+            raise LaserStuck(LASER_NOT_FOLLOWING.text(count=self._follow.standstills))
         if doubt:
             self._notify("info", f"the fix at {_name(request.point)} is doubted: {doubt}")
             return doubt
@@ -176,7 +200,7 @@ class FixService:
         if isinstance(error, BadSolution):
             refusal = self._fix_gate.refusal_of(error.lengths_m, request.expected_m)
             error = FrameRefused(refusal) if refusal else error
-        if isinstance(error, FrameRefused):
+        if isinstance(error, FrameRefused | LaserStuck):
             self._notify("error", str(error))
             if self._is_wanted(request):
                 self._mission.handle(Fault(str(error)))
@@ -209,7 +233,18 @@ class FixService:
             except StoreError as error:
                 mission.handle(Fault(FIX_NOT_STORED.text(point=_name(request.point), why=error)))
                 return
+            self._note_metrology(fix)
         self._mission.handle(FixStored(request.point, self._heading_sigma_of()))
+
+    def _note_metrology(self, fix: Fix) -> None:
+        """Count the points in a row that are no measurements; enough of them are an alarm, and never hold the robot."""
+        self._unreliable = self._unreliable + 1 if fix.metrology == UNRELIABLE else 0
+        self.metrology_cause = ""
+        if self._unreliable >= self._alarm_points:
+            who = " ".join(map(str, fix.suspects))
+            self.metrology_cause = METROLOGY_UNRELIABLE.text(count=self._unreliable, channels=who)
+        if self._unreliable == self._alarm_points:
+            self._notify("warning", self.metrology_cause)
 
     async def _await_commit(self, commit: "Future[Any]", point: PointId) -> None:
         """Wait for a commit while the robot stands; after ``STALLED_DISK_S`` it is a fault. StoreError: it failed."""

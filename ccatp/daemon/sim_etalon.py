@@ -10,18 +10,22 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import Vector3
 from ccatp.daemon.child_processes import listen
-from ccatp.daemon.process import run_until_stopped, start_process
+from ccatp.daemon.process import FAULTS_FILE, run_until_stopped, start_process
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck, ZmqPuck
+from ccatp.sim.fault_plan import FaultPlan, InjectedFault, read_plan
 from ccatp.sim.laser import SEED_STREAM
 
 
-def _run(cfg: Config, puck: ZmqPuck | FixedPuck, listener: socket.socket) -> int:
+def _run(
+    cfg: Config, puck: ZmqPuck | FixedPuck, listener: socket.socket, faults: tuple[InjectedFault, ...] = ()
+) -> int:
     mirror = build_mirror(cfg.mirror)
 
     async def run(stop: asyncio.Event) -> int:
         rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
         server = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, rng)
+        server.model.faults = tuple(fault for fault in faults if fault.signal == "laser")
         await server.start(listener)
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -42,7 +46,9 @@ def main() -> int:
     args = start_process()
     if isinstance(args.config, RadioConfig):
         raise TypeError("a mission among beacons has no laser system")
-    return _run(args.config, ZmqPuck(args.endpoints.of("puck")), socket.socket(fileno=args.listen_fd))
+    plan = read_plan(args.run_dir / FAULTS_FILE, lockstep=not args.is_realtime) if args.has_faults else FaultPlan()
+    puck = ZmqPuck(args.endpoints.of("puck"))
+    return _run(args.config, puck, socket.socket(fileno=args.listen_fd), plan.faults)
 
 
 def run_alone(cfg: Config, puck_world_m: Vector3 | None, truth: str | None) -> int:

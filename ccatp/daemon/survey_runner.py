@@ -40,6 +40,7 @@ from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.composition import Checkpoint, SurveyParts
 from ccatp.survey.events import HELD, Abort, EstimateDiverged, Fault, MissionState, SurveyOutcome, TrackingGap
 from ccatp.survey.fix_gate import FixGate
+from ccatp.survey.laser_follow import LaserFollow
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import SurveyState, by_reason
 from ccatp.survey.statechart import Mission
@@ -248,6 +249,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         self._gate_log = GateLog(self.gate, self.telemetry.notify_operator)
         self._fan_gate, self._fans_seq = FanGate(0.0), 0
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
+        self._follow = LaserFollow(cfg)
         self._fix_service = FixService(
             cfg.mission,
             self._etalon,
@@ -260,6 +262,8 @@ class SurveyRunner(SurveyFrames, MissionRunner):
             # no wait in lockstep, whose time stands still meanwhile
             lambda: 0.0 if loop.is_lockstep else cfg.etalon.measuring_time_s,
             parts.heading_sigma_rad,
+            self._follow,
+            cfg.etalon.alarm_points,
         )
         self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
@@ -273,8 +277,8 @@ class SurveyRunner(SurveyFrames, MissionRunner):
 
     @property
     def causes(self) -> list[str]:
-        wait_cause = self._fix_service.wait_cause
-        return [*super().causes, wait_cause] if wait_cause else super().causes
+        own = self._fix_service.wait_cause, self._fix_service.metrology_cause
+        return [*super().causes, *(cause for cause in own if cause)]
 
     @property
     def is_at_rest(self) -> bool:
@@ -373,6 +377,10 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         self.telemetry.log.info("gate_statistics", denied=self._gate_log.counts, fans_refused=self._fan_gate.refused)
 
     # -- the frame ------------------------------------------------------------------------------------------------
+
+    def estimate(self, frame: TimedFrame) -> None:
+        self._follow.add(frame.sensors.imu, frame.sensors.enc)
+        super().estimate(frame)
 
     def _publish_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
         self.telemetry.send("treatment", Treatment(seq=sensors.seq, t_s=sensors.t, kind=kind, values=values))

@@ -230,6 +230,9 @@ _PARSERS: dict[str, Callable[[str], Reply]] = {
 }
 
 
+_MAX_LENGTH_M = 1e6  # of a length in any unit that may have been confused; far from overflow in its square
+
+
 def valid_lengths(data: ChannelData, channels: Sequence[int]) -> tuple[dict[int, float], dict[int, str]]:
     """Length in m by asked channel, and for those without a usable one the reason; both in the order asked.
 
@@ -244,7 +247,7 @@ def valid_lengths(data: ChannelData, channels: Sequence[int]) -> tuple[dict[int,
             reasons[channel] = "absent"
         elif record.errors:
             reasons[channel] = "+".join(record.errors)
-        elif not math.isfinite(record.length_mm) or record.length_mm * 1e-3 <= 0.0:  # the smallest numbers become zero
+        elif not 0.0 < record.length_mm * 1e-3 <= _MAX_LENGTH_M:  # the smallest numbers become zero
             reasons[channel] = f"length {record.length_mm} mm"
         else:
             lengths_m[channel] = record.length_mm * 1e-3

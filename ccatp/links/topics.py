@@ -169,6 +169,14 @@ class FixMessage(Message):
     channels: list[int]
     jump_mm: float
     is_set_aside: bool = False  # doubted before the localizer saw it
+    # Not in recordings of older versions; as in ``core.Fix``.
+    left_out: list[int] = []
+    lengths_m: list[float] = []
+    metrology: str = ""
+    suspects: list[int] = []
+    detectable_m: float | None = None
+    protection_m: float | None = None
+    warnings: list[str] = []
 
 
 class Rest(Message):

@@ -9,6 +9,7 @@ from scipy.special import chdtri
 
 from ccatp.config.models import AlignConfig
 from ccatp.core import PanelId, Vector3
+from ccatp.mirror.length_integrity import UNRELIABLE
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import (
     Deviations,
@@ -25,6 +26,7 @@ from ccatp.mirror.panel_alignment import (
 from ccatp.mirror.surface import ConvergenceError
 
 ENOUGH = 3  # points of a plane
+_NAMED = 12  # largest number of unreliable points that are named
 
 
 class Undetermined(NamedTuple):
@@ -74,6 +76,7 @@ def survey_result(
     light = cfg.light.get(mirror.name)
     if light is None:
         warnings.append(f"no light is configured for {mirror.name} (align.light): its angle of incidence is taken as 0")
+    warnings += _unreliable(by_panel.values())
     price = prices(cfg.false_alarm, sum(len(found.points) for found in usable.values()), len(usable))
     panels = []
     for panel, found in usable.items():
@@ -107,6 +110,16 @@ def _deviations(
     if not (found.sigmas_m > 0.0).all():
         return None, "a fix claims to be exact: its covariance is not positive"
     return found, ""
+
+
+def _unreliable(by_panel: Iterable[Sequence[Measured]]) -> list[str]:
+    """Points whose lengths contradict each other: their wide covariance gives them little weight."""
+    points = [one.point for some in by_panel for one in some if one.fix.metrology == UNRELIABLE]
+    if not points:
+        return []
+    names = ", ".join(f"{row}/{col}/{number}" for row, col, number in points[:_NAMED])
+    more = f" and {len(points) - _NAMED} more" if len(points) > _NAMED else ""
+    return [f"unreliable, their lengths contradict each other: {names}{more}; check the laser, measure them again"]
 
 
 def _remarks(result: PanelResult, rare: float) -> list[str]:

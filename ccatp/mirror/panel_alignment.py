@@ -41,6 +41,7 @@ class Deviations(NamedTuple):
     values_m: FloatArray
     sigmas_m: FloatArray
     lever: FloatArray
+    metrology: tuple[str, ...] = ()
 
 
 def deviations_of(
@@ -67,6 +68,7 @@ def deviations_of(
         values_m=np.array([deviation for _, _, deviation in feet]),
         sigmas_m=np.sqrt(variances),
         lever=np.array(normals) @ np.array(body.axes[2]),
+        metrology=tuple(one.fix.metrology for one in chosen),
     )
 
 

@@ -28,7 +28,7 @@ from ccatp.config.files import sync_folder
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.mirror.panel_alignment import Measured
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 BUSY_TIMEOUT_S = 30.0  # an outside reader may hold its lock for this long
 RESERVE_BYTES = 2 * 1024 * 1024  # five times what 800 fixes and 2,000 arrivals take
 QUEUE_LIMIT = 1000
@@ -44,6 +44,11 @@ CREATE TABLE fixes (
   cov_zx_m2 REAL NOT NULL, cov_zy_m2 REAL NOT NULL, cov_zz_m2 REAL NOT NULL,
   dop REAL NOT NULL, residual_rms_m REAL NOT NULL, channels TEXT NOT NULL,
   estimate_x_m REAL NOT NULL, estimate_y_m REAL NOT NULL, estimate_heading_rad REAL NOT NULL, -- deck frame
+  left_out TEXT NOT NULL, -- channels, valid but contradicting the others
+  lengths_m TEXT NOT NULL, -- of channels, then of left_out
+  metrology TEXT NOT NULL, -- good, unchecked or unreliable
+  suspects TEXT NOT NULL, -- channels that contradict each other
+  detectable_m REAL, protection_m REAL,
   crc INTEGER NOT NULL);
 CREATE TABLE points (
   row INTEGER NOT NULL, col INTEGER NOT NULL, point INTEGER NOT NULL,
@@ -60,10 +65,22 @@ CREATE TABLE arrivals (
 CREATE TABLE reserve (id INTEGER PRIMARY KEY, used INTEGER NOT NULL, filler BLOB NOT NULL);
 CREATE TABLE ballast (filler BLOB);
 """
+# A database of version 1 is read and continued; its fixes have no lengths.
+_NEW_COLUMNS = """  left_out TEXT NOT NULL, -- channels, valid but contradicting the others
+  lengths_m TEXT NOT NULL, -- of channels, then of left_out
+  metrology TEXT NOT NULL, -- good, unchecked or unreliable
+  suspects TEXT NOT NULL, -- channels that contradict each other
+  detectable_m REAL, protection_m REAL,
+"""
+_SCHEMAS = {"1": _SCHEMA.replace(_NEW_COLUMNS, ""), str(SCHEMA_VERSION): _SCHEMA}
 _PAGE_FILLER = 3900  # bytes; one row fills a page
 _JOURNAL_PAGES = 48  # room kept in the journal; a commit of one fix touches about six pages
 _CRC_KEY, _RUN_ID_KEY = "crc", "run_id"
-_INSERT_FIX = "INSERT INTO fixes VALUES (NULL,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)"
+_OLD_VALUES, _VALUES = 22, 28  # of a fix in version 1 and now, without number and checksum
+_INSERT_FIX = {
+    count: f"INSERT INTO fixes VALUES (NULL{',?' * (count + 1)})"  # noqa: S608 - only marks vary
+    for count in (_OLD_VALUES, _VALUES)
+}
 _STATUS = "SELECT status FROM points WHERE row = ? AND col = ? AND point = ?"
 _SET_STATUS = "UPDATE points SET status = ?, t_s = ?, fix_id = ? WHERE row = ? AND col = ? AND point = ?"
 # Errors of a request, not of the file.
@@ -381,14 +398,14 @@ def _check_file(db: sqlite3.Connection, path: Path, mirror: str) -> None:
         raise StoreError(f"{path}: damaged: cut off at {path.stat().st_size} of {pages * page_bytes} bytes")
     meta = dict(db.execute("SELECT key, value FROM meta"))
     version = meta.get("schema_version")
-    if version != str(SCHEMA_VERSION):
+    if version not in _SCHEMAS:
         raise StoreError(
             f"{path}: schema version {version}, this program has {SCHEMA_VERSION}; use a new run directory"
         )
     with closing(sqlite3.connect(":memory:")) as expected:
-        expected.executescript(_SCHEMA)
+        expected.executescript(_SCHEMAS[version])
         if _tables(db) != _tables(expected):
-            raise StoreError(f"{path}: damaged: its tables are not those of schema version {SCHEMA_VERSION}")
+            raise StoreError(f"{path}: damaged: its tables are not those of schema version {version}")
     if meta.get(_CRC_KEY) != str(_plan_crc(db)):
         raise StoreError(f"{path}: damaged: meta data or targets do not match their checksum")
     if meta.get("mirror") != mirror:
@@ -417,10 +434,18 @@ def _insert_fix(db: sqlite3.Connection, point: PointId, fix: Fix, estimate: Deck
     if len(fix.covariance_m2) != 9 or not all(map(isfinite, (*before, *after))):
         raise StoreRefusal(f"fix of {point_name(point)}: a value is not finite, or the covariance is not of 9 values")
     channels = ",".join(str(int(channel)) for channel in fix.channels)
-    values = (*map(int, point), *map(float, before), channels, *map(float, after))
+    limits = (None if limit is None else float(limit) for limit in (fix.detectable_m, fix.protection_m))
+    lengths = ",".join(repr(float(length)) for length in fix.lengths_m)
+    lists = [",".join(str(int(channel)) for channel in some) for some in (fix.left_out, fix.suspects)]
+    values: tuple[Any, ...] = (
+        *map(int, point), *map(float, before), channels, *map(float, after),
+        lists[0], lengths, fix.metrology, lists[1], *limits,
+    )  # fmt: skip
+    if db.execute("SELECT value FROM meta WHERE key = 'schema_version'").fetchone() == ("1",):
+        values = values[:_OLD_VALUES]
     if _status(db, point) == "measured":
         raise AlreadyMeasuredError(f"point {point_name(point)} has been measured; its fix is not replaced")
-    number = db.execute(_INSERT_FIX, (*values, _crc(values))).lastrowid
+    number = db.execute(_INSERT_FIX[len(values)], (*values, _crc(values))).lastrowid
     db.execute(_SET_STATUS, ("measured", float(fix.t_s), number, *point))
     return int(number or 0)
 
@@ -432,10 +457,21 @@ def _points(db: sqlite3.Connection) -> list[StoredPoint]:
 def _fixes(db: sqlite3.Connection) -> list[Measured]:
     found = []
     for r in db.execute("SELECT * FROM fixes WHERE id IN (SELECT fix_id FROM points) ORDER BY id"):
-        channels = tuple(int(c) for c in r[19].split(",") if c)
-        fix = Fix(r[4], (r[5], r[6], r[7]), tuple(r[8:17]), r[17], channels, r[18])
+        judged: dict[str, Any] = {}
+        if len(r) > _OLD_VALUES + 2:
+            left_out, lengths, metrology, suspects, detectable_m, protection_m = r[_OLD_VALUES + 1 : -1]
+            judged = {
+                "left_out": _integers(left_out), "lengths_m": tuple(float(one) for one in lengths.split(",") if one),
+                "metrology": metrology, "suspects": _integers(suspects), "detectable_m": detectable_m,
+                "protection_m": protection_m,
+            }  # fmt: skip
+        fix = Fix(r[4], (r[5], r[6], r[7]), tuple(r[8:17]), r[17], _integers(r[19]), r[18], **judged)
         found.append(Measured(PointId(*r[1:4]), fix))
     return found
+
+
+def _integers(text: str) -> tuple[int, ...]:
+    return tuple(int(one) for one in text.split(",") if one)
 
 
 def _status(db: sqlite3.Connection, point: PointId) -> str:

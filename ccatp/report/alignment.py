@@ -57,6 +57,7 @@ def panel_data(panel: PanelResult) -> dict[str, Any]:
     one, y, x = np.array([np.ones(len(found.points)), *found.places_m.T[::-1]])
     left = found.values_m - found.lever * (np.column_stack([one, y, x]) @ panel.fit.values)
     rows = zip(found.points, found.places_m, found.values_m, found.sigmas_m, left, panel.is_kept, strict=True)
+    marks = found.metrology or [""] * len(found.points)
     return {
         "row": panel.panel.row,
         "col": panel.panel.col,
@@ -96,8 +97,9 @@ def panel_data(panel: PanelResult) -> dict[str, Any]:
                 "sigma_um": _um(sigma),
                 "residual_um": _um(residual),
                 "is_outlier": not is_kept,
+                "metrology": metrology,
             }
-            for point, (x_m, y_m), value, sigma, residual, is_kept in rows
+            for (point, (x_m, y_m), value, sigma, residual, is_kept), metrology in zip(rows, marks, strict=True)
         ],
     }
 

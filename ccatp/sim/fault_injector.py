@@ -230,6 +230,8 @@ class Injector:
         children = rng.spawn(len(records)) if records else []
         for record, child in zip(records, children, strict=True):
             fault = record.fault
+            if fault.signal == "laser":
+                continue  # by the simulated laser server
             if fault.signal not in SIGNALS:
                 self._on["body" if fault.signal in _BODY_SIGNALS else fault.signal].append(record)
             # Fans and battery are in every frame, without a time of their own, so a delay gives old readings.

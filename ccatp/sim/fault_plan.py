@@ -117,6 +117,7 @@ _Nth = Annotated[int, Field(ge=1, le=1_000_000)]
 _SecondOrLater = Annotated[int, Field(ge=2, le=1_000_000)]
 _ByteCount = Annotated[int, Field(ge=1, le=65536)]
 _NUMBER = (float | None, None)
+_CHANNEL = (Annotated[int, Field(ge=1, le=32)] | None, None)
 _RaisedName = Literal["imu", "encoder_left", "encoder_right", "edge", "fan_left", "fan_right", "battery_low", "stall"]
 
 _SLIP = {"factor": Annotated[float, Field(ge=0.0, le=2.0)]}
@@ -171,6 +172,21 @@ TYPES: dict[str, dict[str, type[InjectedFault]]] = {
     ),
     # The robot itself reports ``names`` in its frames.
     "faults": _types(LastingFault, {"raise": {"names": Annotated[tuple[_RaisedName, ...], Field(min_length=1)]}}),
+    # The simulated laser system. Errors of one channel, or of all without ``channel``: ``offset_m``, ``rate_m_s`` times
+    # the time since the begin, in proportion (``factor``), rounded, the last length again, or ``factor`` times the noise.
+    # ``at_rest``: it stays at the puck's place of the begin, with new noise.
+    "laser": _types(
+        LastingFault,
+        {
+            "offset": {"channel": _CHANNEL, "offset_m": float},
+            "drift": {"channel": _CHANNEL, "rate_m_s": float},
+            "scaled": {"channel": _CHANNEL, "factor": Positive},
+            "rounded": {"channel": _CHANNEL, "to_m": Positive},
+            "frozen": {"channel": _CHANNEL},
+            "noisy": {"channel": _CHANNEL, "factor": Positive},
+            "at_rest": {},
+        },
+    ),
     # The robot reboots: boot number (unless its firmware does not count boots), clock, sequence numbers and fans; every
     # session is lost.
     "robot": _types(InjectedFault, {"reboot": {"keeps_number": (bool, False)}}),

@@ -6,6 +6,7 @@ client, a repeated request or another order of channels never changes the length
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -49,6 +50,8 @@ class EtalonModel:
         self._key = int(rng.integers(2**63))
         self.blocked: set[int] = set()
         self.flags: dict[int, set[str]] = {}  # further error flags to raise, out of FLAGS, by channel
+        self.faults: tuple[Any, ...] = ()  # of a plan, signal "laser"
+        self._held: dict[Any, Any] = {}  # by fault, what it keeps from its begin
         self.laser_ready = True  # while false, each record carries ``laser_temp_error``
         self.environment = AIR
 
@@ -78,9 +81,35 @@ class EtalonModel:
             flags.add("laser_temp_error")
         if channel in self.blocked:
             return self._format(channel, 0.0, flags | {"beam_break"})
-        length_m = math.dist(collimator, puck.position_m)
+        active = [(key, one) for key, one in enumerate(self.faults) if one.is_active(puck.t_s)]
+        position_m = puck.position_m
+        for key, fault in active:
+            if fault.type == "at_rest":
+                position_m = self._held.setdefault(key, position_m)
+        length_m = math.dist(collimator, position_m)
         sigma_m = self._cfg.length_sigma_m + self._cfg.length_sigma_per_m * length_m
-        return self._format(channel, length_m + sigma_m * self._noise(puck.t_s, channel), flags)
+        error_m = sigma_m * self._noise(puck.t_s, channel)
+        found_m = length_m + error_m
+        for key, fault in active:
+            if getattr(fault, "channel", channel) in (None, channel):
+                found_m = self._with_fault(fault, (key, channel), puck.t_s, found_m, error_m)
+        return self._format(channel, found_m, flags)
+
+    def _with_fault(self, fault: Any, key: tuple[int, int], t_s: float, length_m: float, error_m: float) -> float:
+        match fault.type:
+            case "offset":
+                return length_m + float(fault.offset_m)
+            case "drift":
+                return length_m + float(fault.rate_m_s) * (t_s - float(fault.at_s))
+            case "scaled":
+                return length_m * float(fault.factor)
+            case "rounded":
+                return round(length_m / fault.to_m) * float(fault.to_m)
+            case "frozen":
+                return float(self._held.setdefault(key, length_m))
+            case "noisy":
+                return length_m + (float(fault.factor) - 1.0) * error_m
+        return length_m
 
     def _noise(self, t_s: float, channel: int) -> float:
         """Standard normal number, a function of this channel and this time (rounded to a microsecond)."""

@@ -183,7 +183,7 @@ class FixGate:
         beyond = self._gate_nis is None and nis > _FAR * cfg.doubt_nis
         if agreeing >= (_CONSISTENT if beyond else 2):
             return ""
-        return f"it is {1e3 * hypot(foot.x_m - pose.x_m, foot.y_m - pose.y_m):.1f} mm from the estimate (NIS {nis:.3g})"
+        return f"it is {1e3 * hypot(foot.x_m - pose.x_m, foot.y_m - pose.y_m):.3g} mm from the estimate (NIS {nis:.3g})"
 
     def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> str:
         """Why the laser system is refused when lengths gave no position; empty after the first fix."""

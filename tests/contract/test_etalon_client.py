@@ -275,10 +275,33 @@ async def test_every_failure_is_retried_as_often_as_configured(server: ScriptedS
 
 async def test_lengths_that_contradict_each_other_are_refused(server: ScriptedServer) -> None:
     wrong = records()
-    wrong[5] = wrong[5]._replace(length_mm=wrong[5].length_mm + 2.0)
+    for k, error_mm in enumerate((20.0, -20.0, 15.0, -25.0, 20.0, -15.0, 25.0, -20.0)):
+        wrong[k] = wrong[k]._replace(length_mm=wrong[k].length_mm + error_mm)
     server.script.append(format_reply(ChannelData(tuple(wrong))))
     async with client_of(server.port) as client:
-        with pytest.raises(BadSolution, match=r"largest residual 1\.\d+ mm exceeds 0\.5 mm; channels \(1, 2, 3, 4,"):
+        with pytest.raises(BadSolution, match=r"contradict each other by up to .* mm, more than 5 mm"):
+            await client.measure(1.0, EXPECTED)
+
+
+@pytest.mark.parametrize("error_mm", [0.1, 2.0, 10.0, 300.0, 5000.0, 1e308])
+async def test_one_wrong_channel_is_left_out_and_only_it_is_named(server: ScriptedServer, error_mm: float) -> None:
+    wrong = records()
+    wrong[5] = wrong[5]._replace(length_mm=wrong[5].length_mm + error_mm)
+    server.script.append(format_reply(ChannelData(tuple(wrong))))
+    async with client_of(server.port) as client:
+        fix = await client.measure(1.0, EXPECTED)
+    assert_at(fix, PUCK)
+    assert fix.channels == tuple(channel for channel in CHANNELS if channel != CHANNELS[5])
+    if error_mm < 1e308:  # that one is no length at all
+        assert fix.left_out == (CHANNELS[5],)
+        assert fix.metrology == "good"
+
+
+async def test_lengths_beyond_any_number_are_one_failed_measurement(server: ScriptedServer) -> None:
+    wrong = [one._replace(length_mm=1e308) for one in records()]
+    server.script.append(format_reply(ChannelData(tuple(wrong))))
+    async with client_of(server.port) as client:
+        with pytest.raises(EtalonError, match="1e\\+308"):
             await client.measure(1.0, EXPECTED)
 
 

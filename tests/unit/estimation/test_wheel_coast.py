@@ -49,7 +49,8 @@ def driven(lag_s: float, frames: int = 150) -> tuple[Servo, WheelCoast]:
 @pytest.mark.parametrize("lag_s", [0.065, 0.08, 0.095])
 def test_wheels_that_run_down_turn_as_a_servo_does_whose_lag_was_learned(lag_s: float) -> None:
     servo, coast = driven(lag_s, 400)
-    coast.begin(*servo.rates.tolist(), 1e-10, is_resting=False)
+    right, left = servo.rates.tolist()
+    coast.begin(right, left, 1e-10, is_resting=False)
     off, variance = np.zeros(2), np.zeros(2)
     for k in range(80):
         set_points = SetPoints(3.0, 2.0) if k < 15 else STILL
@@ -59,7 +60,7 @@ def test_wheels_that_run_down_turn_as_a_servo_does_whose_lag_was_learned(lag_s: 
         # A prediction that only kept the rate of before the gap would be 0.24 rad too far at its end.
         assert np.all(np.abs(off) < 3.0 * np.sqrt(variance) + 1e-9)
         assert np.all(np.abs(off) < 0.01)  # a third of a millimetre; the lag alone was wrong by 0.045 rad
-    assert coast.rates == (pytest.approx(0.0, abs=0.01), pytest.approx(0.0, abs=0.01))  # after seven times the lag
+    assert list(coast.rates) == pytest.approx([0.0, 0.0], abs=0.01)  # after seven times the lag
 
 
 def test_a_prediction_from_rest_starts_with_the_drive_that_comes_in_the_gap() -> None:
@@ -79,7 +80,8 @@ def test_every_growth_of_the_covariance_is_one() -> None:
     rng = np.random.default_rng(5)
     for _ in range(20):
         servo, coast = driven(0.08, int(rng.integers(3, 40)))
-        coast.begin(*servo.rates.tolist(), 1e-6, is_resting=False)
+        right_rad_s, left_rad_s = servo.rates.tolist()
+        coast.begin(right_rad_s, left_rad_s, 1e-6, is_resting=False)
         for _ in range(40):
             known = SetPoints(*rng.uniform(-5.0, 5.0, 2).tolist(), *rng.uniform(-0.01, 0.01, 2).tolist())
             *_, right, left, both = coast.advance(FRAME_S, known if rng.random() < 0.8 else None)
