@@ -32,8 +32,8 @@ _PER_COLLIMATOR = 3
 
 
 def per_fix(cfg: EtalonConfig) -> float:
-    """Probability of a false alarm of one fix. The other half of that of a survey belongs to the running test."""
-    return cfg.false_alarm / (2.0 * SURVEY_FIXES)
+    """Probability of a false alarm of one fix; the rest of that of a survey belongs to the running tests."""
+    return 0.4 * cfg.false_alarm / SURVEY_FIXES
 
 
 class Parity(NamedTuple):
@@ -114,8 +114,9 @@ class Judgement(NamedTuple):
 
     ``used``, ``left_out``: channels; ``suspects``: those that contradict each other. ``detectable_m``: error of a
     length found with probability 0.999, in the worst channel (infinite without redundancy). ``protection_m``: error of
-    the position by such an undetected fault, with the noise. ``inconsistency_m``: error of the position that the
-    contradiction allows. ``w``: standardised errors by channel, of a good fix.
+    the position by an undetected fault of one channel, or of all (offset, scale) alike, with the noise.
+    ``inconsistency_m``: error of the position that the contradiction allows. ``w``: standardised errors
+    by channel, of a good fix.
     """
 
     solution: RangeSolution
@@ -211,14 +212,17 @@ class LengthIntegrity:
     def _chi2_of_common(self, whole: _Subset) -> float:
         """Chi-square if an error common to all lengths, in m or in proportion, is the explanation."""
         parity, best = whole.parity, whole.chi2
-        distances_m = whole.solution.residuals_m * 0.0 + 1.0
-        scale = self.network.design(parity.rows, np.zeros((len(parity.rows), 3)), self._lengths_of(whole))[:, -1]
-        for error in (distances_m, scale):
+        for error in self._common(whole):
             pattern = error @ parity.basis
             weighted = np.linalg.solve(parity.covariance, pattern)
             gain = float(weighted @ whole.innovation) ** 2 / float(pattern @ weighted)
             best = min(best, whole.chi2 - gain)
         return best
+
+    def _common(self, some: _Subset) -> FloatArray:
+        """Errors common to all lengths: an offset, and a scale; (2, m)."""
+        lengths_m = self._lengths_of(some)
+        return np.array([np.ones(len(lengths_m)), lengths_m])
 
     def _lengths_of(self, some: _Subset) -> FloatArray:
         anchors_m = np.array([self._collimators_m[channel] for channel in some.channels])
@@ -237,7 +241,11 @@ class LengthIntegrity:
         dof = len(some.innovation)
         # A chi-square above its limit needs at most this error of a single channel, in sigmas of that error.
         least = float(np.sqrt(self._limit(dof)) + ndtri(_POWER))
-        slopes = self._slopes(some)
+        moves = self._moves(some)
+        slopes = np.linalg.norm(moves, axis=0)
+        patterns = self._common(some) @ some.parity.basis
+        visible = np.sum(patterns * np.linalg.solve(some.parity.covariance, patterns.T).T, axis=1)
+        common_m = np.linalg.norm(moves @ self._common(some).T, axis=0) / np.sqrt(np.maximum(visible, 1e-30))
         noise_m = _COVER * float(np.sqrt(np.linalg.eigvalsh(some.solution.covariance_m2)[-1]))
         worst_m = float(np.max(slopes * sigmas))
         is_checked = len(some.channels) >= _DETECTED_FROM
@@ -250,16 +258,17 @@ class LengthIntegrity:
             chi2=some.chi2,
             dof=dof,
             detectable_m=least * float(np.max(sigmas)) if is_checked else float("inf"),
-            protection_m=least * worst_m + noise_m if is_checked else float("inf"),
-            inconsistency_m=worst_m * float(np.sqrt(some.chi2)) if metrology == UNRELIABLE else 0.0,
+            protection_m=least * max(worst_m, float(np.max(common_m))) + noise_m if is_checked else float("inf"),
+            inconsistency_m=max(worst_m, float(np.max(common_m))) * float(np.sqrt(some.chi2))
+            if metrology == UNRELIABLE
+            else 0.0,
             w={} if metrology == UNRELIABLE else dict(zip(some.channels, w.tolist(), strict=True)),
         )
 
-    def _slopes(self, some: _Subset) -> FloatArray:
-        """Change of the position per error of each length, (m,)."""
+    def _moves(self, some: _Subset) -> FloatArray:
+        """Change of the position per error of each length, (3, m)."""
         lengths_m = self._lengths_of(some)
         anchors_m = np.array([self._collimators_m[channel] for channel in some.channels])
         directions = (some.solution.position_m - anchors_m) / lengths_m[:, None]
         weights = (self._cfg.length_sigma_m + self._cfg.length_sigma_per_m * lengths_m) ** -2.0
-        gain = some.solution.covariance_m2 @ (directions * weights[:, None]).T
-        return np.asarray(np.linalg.norm(gain, axis=0))
+        return np.asarray(some.solution.covariance_m2 @ (directions * weights[:, None]).T)

@@ -24,11 +24,11 @@ _OVERSHOOT = 1.166  # of a cumulative sum beyond its limit in discrete time; Sie
 
 
 def sum_limit(cfg: EtalonConfig, count: int, allowance: float) -> float:
-    """Limit of a cumulative sum, Siegmund's approximation, for a quarter of the false alarms of a survey.
+    """Limit of a cumulative sum, Siegmund's approximation, for a fifth of the false alarms of a survey.
 
     The sums of ``count`` channels, both signs and both allowances share it.
     """
-    one = cfg.false_alarm / (4.0 * SURVEY_FIXES * 2 * len(_ALLOWANCES) * count)
+    one = 0.2 * cfg.false_alarm / (SURVEY_FIXES * 2 * len(_ALLOWANCES) * count)
     return float(-log(one / (2.0 * allowance**2)) / (2.0 * allowance) - 2.0 * _OVERSHOOT / 2.0)
 
 

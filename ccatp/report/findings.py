@@ -16,6 +16,7 @@ from ccatp.core import DeckPose, Fix, FloatArray, PointId, StopKind
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.filters.metrics import Consistency, consistency, rms
 from ccatp.mirror.layout import POINTS_PER_PANEL
+from ccatp.mirror.length_integrity import UNRELIABLE
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m, distribution, measured_error_m
 from ccatp.records.timeline import common_rows, row_before, rows_of
@@ -186,6 +187,8 @@ class Quality(NamedTuple):
 
     fixes: int  # in the recordings
     refused: int  # of them: doubted or not usable
+    unreliable: int  # fixes that count, whose lengths contradict each other
+    left_out: tuple[int, ...]  # channels that contradicted the others in a fix that counts
     lengths_um: FloatArray  # rms of the length residuals of each fix that counts
     plane: Consistency | None  # chi^2 of the fitted panels, divided by its degrees of freedom
     plane_rms_um: float | None  # of the residuals of their planes
@@ -216,6 +219,8 @@ def quality_of(record: RunRecord, alignment: SurveyResult | None) -> Quality:
     return Quality(
         fixes=len(recorded),
         refused=sum(not fix.is_fused for _, fix in recorded),
+        unreliable=sum(one.fix.metrology == UNRELIABLE for one in record.measured),
+        left_out=tuple(sorted({channel for one in record.measured for channel in one.fix.left_out})),
         lengths_um=1e6 * np.array([one.fix.residual_rms_m for one in record.measured]),
         plane=consistency(chi2, dof),
         plane_rms_um=rms(1e6 * np.concatenate([panel.fit.residuals_m for panel in panels] or [np.empty(0)])),

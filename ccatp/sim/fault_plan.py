@@ -173,7 +173,7 @@ TYPES: dict[str, dict[str, type[InjectedFault]]] = {
     # The robot itself reports ``names`` in its frames.
     "faults": _types(LastingFault, {"raise": {"names": Annotated[tuple[_RaisedName, ...], Field(min_length=1)]}}),
     # The simulated laser system. Errors of one channel, or of all without ``channel``: ``offset_m``, ``rate_m_s`` times
-    # the time since the begin, in proportion (``factor``), rounded, the last length again, or ``factor`` times the noise.
+    # the time since the begin, in proportion, rounded, the last length again, or ``factor`` times the noise.
     # ``at_rest``: it stays at the puck's place of the begin, with new noise.
     "laser": _types(
         LastingFault,

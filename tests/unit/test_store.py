@@ -9,6 +9,7 @@ import threading
 import zlib
 from concurrent.futures import Future
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,27 @@ def test_a_fix_comes_back_as_it_was(path: Path) -> None:
     ]
     meta = dict(select(path, "SELECT key, value FROM meta"))
     assert (meta["seed"], meta["config_sha256"]) == ("1", hashlib.sha256(b"[run]\n").hexdigest())
+
+
+def test_lengths_and_their_judgement_come_back(path: Path) -> None:
+    judged = {"left_out": (7,), "lengths_m": (4.1, 5.2, 6.3, 7.4, 0.1), "metrology": "unreliable", "suspects": (1, 7)}
+    fix = replace(a_fix(), **judged, detectable_m=3e-5, protection_m=None)
+    with make(path) as db:
+        db.record_fix(PANEL[0], fix, POSE).result()
+    assert store.read_survey(path, "fyst-m1").fixes[0].fix == fix
+
+
+def test_a_database_of_version_1_is_read_and_continued(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as old:
+        old.setattr(store, "SCHEMA_VERSION", 1)
+        old.setattr(store, "_SCHEMA", store._SCHEMAS["1"])
+        make(path).close()
+    assert "lengths_m" not in store._SCHEMAS["1"]
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        db.record_fix(PANEL[0], replace(a_fix(), lengths_m=(1.0,), metrology="good"), POSE).result()
+        assert db.fixes()[0].fix == a_fix()
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        assert (db.damaged, measured(db)) == ((), {PANEL[0]})
 
 
 def test_a_measured_point_is_not_measured_again(path: Path) -> None:
@@ -177,9 +199,9 @@ def test_create_survives_the_leftovers_of_a_killed_one(path: Path) -> None:
     ("statement", "why"),
     [
         ("UPDATE meta SET value = 'fyst-m2' WHERE key = 'mirror'", "meta data or targets do not match their checksum"),
-        ("UPDATE meta SET value = '99' WHERE key = 'schema_version'", "schema version 99, this program has 1"),
+        ("UPDATE meta SET value = '99' WHERE key = 'schema_version'", "schema version 99, this program has 2"),
         ("UPDATE points SET x_m = 0.23 WHERE point = 3", "do not match their checksum"),
-        ("ALTER TABLE events RENAME COLUMN cause TO clause", "its tables are not those of schema version 1"),
+        ("ALTER TABLE events RENAME COLUMN cause TO clause", "its tables are not those of schema version 2"),
     ],
 )
 def test_open_refuses_what_was_altered(path: Path, statement: str, why: str) -> None:
