@@ -104,7 +104,7 @@ class EtalonModel:
             case "scaled":
                 return length_m * float(fault.factor)
             case "rounded":
-                return round(length_m / fault.to_m) * float(fault.to_m)
+                return round(length_m / float(fault.to_m)) * float(fault.to_m)
             case "frozen":
                 return float(self._held.setdefault(key, length_m))
             case "noisy":

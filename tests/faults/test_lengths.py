@@ -21,7 +21,8 @@ KINDS = ("offset", "drift", "frozen", "huge", "rounded", "scaled", "all long", "
 
 
 def first_of(found: Alarms) -> FloatArray:
-    return np.minimum.reduce(found)
+    first: FloatArray = np.minimum.reduce(found)
+    return first
 
 
 @pytest.mark.parametrize(
@@ -118,7 +119,7 @@ def attack(kind: str, count: int, rng: np.random.Generator) -> Walk:
             if kind == "all long":
                 lengths = {channel: value + size_m for channel, value in lengths.items()}
         try:
-            fix = judge.fix(1.0, tuple((puck + rng.normal(scale=1e-3, size=3)).tolist()), lengths)  # type: ignore[arg-type]
+            fix = judge.fix(1.0, tuple((puck + rng.normal(scale=1e-3, size=3)).tolist()), lengths)
         except MultilaterationError:
             refused += 1
             continue

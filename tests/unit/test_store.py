@@ -64,8 +64,8 @@ def test_a_fix_comes_back_as_it_was(path: Path) -> None:
 
 
 def test_lengths_and_their_judgement_come_back(path: Path) -> None:
-    judged = {"left_out": (7,), "lengths_m": (4.1, 5.2, 6.3, 7.4, 0.1), "metrology": "unreliable", "suspects": (1, 7)}
-    fix = replace(a_fix(), **judged, detectable_m=3e-5, protection_m=None)
+    judged = replace(a_fix(), left_out=(7,), lengths_m=(4.1, 5.2, 6.3, 7.4, 0.1))
+    fix = replace(judged, metrology="unreliable", suspects=(1, 7), detectable_m=3e-5, protection_m=None)
     with make(path) as db:
         db.record_fix(PANEL[0], fix, POSE).result()
     assert store.read_survey(path, "fyst-m1").fixes[0].fix == fix
