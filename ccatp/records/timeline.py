@@ -191,9 +191,14 @@ class Timeline:
         behind = np.flatnonzero(self._seq[max(at - NEAR_FRAMES, 0) : at] == seq)
         return max(at - NEAR_FRAMES, 0) + int(behind[-1]) if len(behind) else None
 
-    def number_at(self, place: int, seq: int) -> int:
-        """Number of frame ``seq`` of the robot, as a message at ``place`` of the recording names it."""
-        if not len(self._seq):
+    def number_at(self, place: int, seq: int, *, is_main: bool = True) -> int:
+        """Number of frame ``seq`` of the robot, as a message at ``place`` of the recording names it.
+
+        ``is_main``: main sent it, so it follows the batches and sessions that were recorded before it. A message of
+        another process may be a little older.
+        """
+        count = len(self._seq)
+        if not count:
             return seq
         at = bisect_right(self._places, place)
         if seq < 0 and not at:
@@ -201,19 +206,26 @@ class Timeline:
         if seq < 0:  # no frame since the robot restarted
             later = [start for start in self._starts if at <= start < at + NEAR_FRAMES]
             return int(self._number[(later[0] if later else at) - 1])
-        until = bisect_right(self._session_places, place)
-        if until < len(self._session_places):  # frames of a later session do not belong to this message
-            ends = bisect_left(self._places, self._session_places[until])
-            near = np.flatnonzero(self._seq[at:ends] == seq)
-            if not (at and self._seq[at - 1] == seq) and len(near):
-                return int(self._number[at + int(near[0])])
-        index = self._index(place, seq)
+        session = bisect_right(self._session_places, place)
+        begin, end = (self._first_line(session - 1) if session else 0), self._first_line(session)
+        if begin < at and self._seq[at - 1] == seq:
+            return int(self._number[at - 1])
+        ahead = np.flatnonzero(self._seq[max(at, begin) : min(at + NEAR_FRAMES, end)] == seq)
+        if len(ahead):
+            return int(self._number[max(at, begin) + int(ahead[0])])
+        index = None if is_main else self._index(place, seq)
         if index is not None:
             return int(self._number[index])
-        # Its line is not there. It is of the robot's present boot, or of the next one if it is before the last line.
-        before = bisect_right(self._starts, max(at - 1, 0)) - 1
-        is_next = at > 0 and seq < self._seq[at - 1] and seq < self._seq[self._starts[before]]
-        return int(self._base[min(before + is_next, len(self._base) - 1)] + seq)
+        # Its line is lost. It is of the boot of its session; without sessions it is not older than the last batch.
+        part = bisect_right(self._starts, min(max(begin, at - 1, 0), count - 1)) - 1
+        is_next = not session and at > 0 and seq < self._seq[at - 1] and is_main
+        return int(self._base[min(part + is_next, len(self._base) - 1)] + seq)
+
+    def _first_line(self, session: int) -> int:
+        """Index of the first line after a session began."""
+        if session >= len(self._session_places):
+            return len(self._places)
+        return bisect_right(self._places, self._session_places[session])
 
     def line_numbers(self, place: int, seqs: Sequence[int]) -> list[int]:
         """Numbers of the frames whose lines are in the message at ``place``, in their order."""
@@ -294,7 +306,7 @@ class Timeline:
         if isinstance(message, topics.ArrivalMessage | topics.BeaconArrival):  # with the number that main recorded
             number = int(self.row_numbers(place, [message.seq])[0])
         else:
-            number = self.number_at(place, message.seq)
+            number = self.number_at(place, message.seq, is_main=not isinstance(message, topics.DangerEvent))
         if number < 0 or not len(self.number):
             return message
         return msgspec.structs.replace(message, seq=number, t_s=self.at(number))

@@ -164,6 +164,26 @@ def test_events_belong_to_the_boot_of_their_batch(tmp_path: Path) -> None:
     assert found == [(5, 0.05), (49, 0.49), (54, 0.54), (88, 0.88)]
 
 
+@pytest.mark.parametrize("has_sessions", [True, False])
+def test_an_event_whose_frame_is_lost_after_a_restart_is_not_of_the_boot_before(
+    tmp_path: Path, has_sessions: bool
+) -> None:
+    again = [session(8, 1, 49)] if has_sessions else []
+    begin = [session(7, 3)] if has_sessions else []
+    later = range(30, 60)
+    found = on_axis(
+        tmp_path, *begin, track(FIRST), lines(FIRST), *again, Rest(seq=5, t_s=0.05), track(later, 49), lines(later)
+    )
+    (rest,) = [one for one in found if isinstance(one, Rest)]
+    assert rest.seq == 54
+
+
+def test_an_event_of_danger_may_be_older_than_the_restart(tmp_path: Path) -> None:
+    event = DangerEvent(seq=49, t_s=0.49, code=0, cause="", signal="", value=0.0, limit=0.0, off=(False,) * 4)
+    found = on_axis(tmp_path, session(7, 3), lines(FIRST), session(8, 1, 49), event, lines(SECOND))
+    assert found[3].seq == 49
+
+
 def test_a_status_between_restart_and_first_frame_has_the_time_of_the_last_frame_before_it(tmp_path: Path) -> None:
     status = MissionStatus(seq=-1, t_s=0.0, state="held")
     early, *_, late, _ = on_axis(tmp_path, status, lines(FIRST), status, lines(SECOND))
