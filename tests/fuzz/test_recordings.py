@@ -332,7 +332,7 @@ def classify(readers: Readers, spoiling: Spoiling, folder: Path, names: tuple[st
     return found
 
 
-QUICK = (0, 1, 3, 4, 6, 8)  # a restart, a wrap, a step ahead, a damaged chunk, and two pairs
+QUICK = (0, 1, 4, 6)  # a restart, a wrap, a damaged chunk, and a restart with a wrap
 
 
 @pytest.mark.fault("P25", "P26")
@@ -368,4 +368,4 @@ def test_no_command_is_silently_wrong_in_a_hundred_and_twenty_combinations(
     measured("P26", len(wrong))
     assert wrong == []
     assert len(found) == COUNT * len(READ) - 3 * COUNT // 4
-    assert Counter(found)[RIGHT] > Counter(found)[REPORTED]
+    assert Counter(found)[RIGHT] > len(found) // 3
