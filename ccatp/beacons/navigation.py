@@ -20,7 +20,7 @@ from ccatp.core import FloatArray, WheelSample
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
 from ccatp.links.beacon_messages import BeaconFrame, Ellipse, MoteBurst, RadioScan, worst_sigma_m
 from ccatp.links.robot_messages import Sensors
-from ccatp.sensing.sample_times import possible_samples
+from ccatp.sensing.sample_times import LATEST_S, possible_samples
 
 
 class SelfMap:
@@ -138,7 +138,7 @@ class MeasurementReader:
 
     def read(self, sensors: Sensors, extras: BeaconFrame) -> BeaconMeasurements:
         """The readings of a frame; each wheel sample covers the time since the previous one."""
-        if self._read_to_s is None:
+        if self._read_to_s is None or self._read_to_s > sensors.t + LATEST_S:  # the first, or the clock was set back
             self._read_to_s = sensors.t
         steering = {sample.t_s: sample.steer_rad for sample in extras.steer}
         wheels = [self._interval(sample, steering) for sample in possible_samples(sensors.t, sensors.enc)]

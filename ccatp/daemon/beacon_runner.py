@@ -169,8 +169,8 @@ class BeaconRunner(MissionRunner):
             telemetry.send("estimate", EstimateMessage(*belief.pose, belief.sigma_m, state, seq=seq, t_s=t_s))
             self._trail.append(belief.pose[:2])
         self._collect_echoes(belief.pose)
-        if t_s >= self._map_due_s:
-            self._map_due_s = t_s + self._cfg.mission.map_period_s
+        if frame.t_s >= self._map_due_s:  # by the time that never runs backward
+            self._map_due_s = frame.t_s + self._cfg.mission.map_period_s
             self._publish_map(seq, t_s)
         number = seq + telemetry.frames_before
         telemetry.add_frame(seq, t_s, frame.raw, track_row(number, t_s, mission.navigator))

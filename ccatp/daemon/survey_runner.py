@@ -436,9 +436,9 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         mission, timer, pose = self.mission, self._fault_timer, self.localizer.deck_pose
         is_localized = not (mission.state.is_lost or self.localizer.is_frozen)
         home_s = home_time_s(self.mirror.base_pose, self.cfg.limits, pose.x_m, pose.y_m) if is_localized else None
-        action = timer.watch(sensors.t, sensors.soc, home_s)
+        action = timer.watch(self._clock.t_s, sensors.soc, home_s)
         if action is FaultAction.REMIND:
-            held_s = timer.held_s(sensors.t)
+            held_s = timer.held_s(self._clock.t_s)
             self.telemetry.notify_operator(
                 "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.state.cause}"
             )

@@ -26,7 +26,7 @@ from ccatp.links.beacon_messages import BeaconFrame
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.safety.emergency_latch import EmergencyRules
-from ccatp.sensing.sample_times import possible_samples
+from ccatp.sensing.sample_times import LATEST_S, possible_samples
 
 
 class _Obstacle(NamedTuple):
@@ -166,6 +166,8 @@ class BeaconSafetyRules(EmergencyRules):
 
     def _roll(self, sensors: Sensors, extras: BeaconFrame) -> None:
         steering, vehicle = {sample.t_s: sample.steer_rad for sample in extras.steer}, self._vehicle
+        if self._rolled_to_s is not None and self._rolled_to_s > sensors.t + LATEST_S:
+            self._rolled_to_s = None  # the robot's clock was set back
         for t_s, right, left in possible_samples(sensors.t, sensors.enc):
             if right is not None and left is not None:
                 self._wheels_s = t_s

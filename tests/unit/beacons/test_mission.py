@@ -421,3 +421,20 @@ def test_silent_encoders_hold_a_robot_among_beacons(cfg: RadioConfig) -> None:
         assert (verdict.cause == ENCODERS_STALE.message) is (t_s > 1.0 + limit_s + 1e-9), t_s
     last = verdicts[-1][1]
     assert (last.forward, last.reverse, last.turn) == (False, False, False)
+
+
+def test_wheels_are_read_again_after_the_clock_of_a_robot_was_set_back(cfg: RadioConfig) -> None:
+    rules, reader, robot = BeaconSafetyRules(cfg), MeasurementReader(cfg), BeaconRobot(cfg, RadioWorld(cfg))
+    robot.join("controller")
+    times_s: list[float] = []
+    for k in range(40):
+        robot.advance()
+        sensors, extras = frame_of(robot)
+        if k >= 20:  # as a clock that was set back by a second
+            enc = [sample._replace(t_s=sample.t_s - 1.0) for sample in sensors.enc]
+            steer = [sample._replace(t_s=sample.t_s - 1.0) for sample in extras.steer]
+            sensors, extras = replace(sensors, t=sensors.t - 1.0, enc=enc), replace(extras, steer=steer)
+        rules.step(sensors, extras, None)
+        times_s.append(sum(wheel.interval_s for wheel in reader.read(sensors, extras).wheels))
+    assert times_s[21:] == pytest.approx([cfg.run.step_s] * 19)
+    assert times_s[5:20] == pytest.approx([cfg.run.step_s] * 15)
