@@ -101,6 +101,13 @@ def _deviations(
     mirror: Mirror, cfg: AlignConfig, puck_height_m: float, panel: PanelId, measured: Sequence[Measured]
 ) -> tuple[Deviations | None, str]:
     """Deviations that can be fitted, or None and the reason."""
+    reliable = [one for one in measured if one.fix.metrology != UNRELIABLE]
+    if len(reliable) < ENOUGH <= len(measured):
+        return (
+            None,
+            f"the lengths of {len(measured) - len(reliable)} of its {len(measured)} points contradict each other",
+        )
+    measured = reliable
     if len(measured) < ENOUGH:
         return None, f"{len(measured)} of {ENOUGH} points that it takes"
     try:
@@ -113,13 +120,13 @@ def _deviations(
 
 
 def _unreliable(by_panel: Iterable[Sequence[Measured]]) -> list[str]:
-    """Points whose lengths contradict each other: their wide covariance gives them little weight."""
+    """Points whose lengths contradict each other: they are no measurements, and their errors may be common to all."""
     points = [one.point for some in by_panel for one in some if one.fix.metrology == UNRELIABLE]
     if not points:
         return []
     names = ", ".join(f"{row}/{col}/{number}" for row, col, number in points[:_NAMED])
     more = f" and {len(points) - _NAMED} more" if len(points) > _NAMED else ""
-    return [f"unreliable, their lengths contradict each other: {names}{more}; check the laser, measure them again"]
+    return [f"not used, their lengths contradict each other: {names}{more}; check the laser, measure them again"]
 
 
 def _remarks(result: PanelResult, rare: float) -> list[str]:

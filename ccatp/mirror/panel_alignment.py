@@ -17,6 +17,7 @@ from scipy.special import chdtrc, chdtri
 from ccatp.config.models import LightConfig
 from ccatp.core import BoolArray, Fix, FloatArray, PanelId, PointId, Vector3
 from ccatp.mirror.layout import Panel
+from ccatp.mirror.length_integrity import UNRELIABLE
 from ccatp.mirror.mirror import Mirror
 
 
@@ -311,9 +312,11 @@ _MIN_SPREAD_M = 0.02
 
 
 def fit_panels(mirror: Mirror, measured: Iterable[Measured], puck_height_m: float) -> dict[PanelId, Vector3]:
-    """Piston (m), tip and tilt (rad) of every panel with enough points, for the summary of a survey."""
+    """Piston (m), tip and tilt (rad) of every panel with enough reliable points, for the summary of a survey."""
     by_panel: dict[PanelId, list[Measured]] = {}
     for one in measured:
+        if one.fix.metrology == UNRELIABLE:
+            continue
         by_panel.setdefault(one.point.panel, []).append(one)
     fits = {}
     for panel, own in sorted(by_panel.items()):

@@ -31,6 +31,7 @@ from ccatp.mirror.panel_alignment import (
     deviations_of,
     explain,
     fit_modes,
+    fit_panels,
     gram,
     mirror_wavefront,
     prices,
@@ -355,6 +356,23 @@ def shifted(one: Measured, shift_m: float) -> Measured:
     normal = M1.rotate_world_from_deck(M1.panel(one.point.panel).axes[2])
     x, y, z = (p + shift_m * n for p, n in zip(one.fix.position_m, normal, strict=True))
     return Measured(one.point, replace(one.fix, position_m=(x, y, z)))
+
+
+def unreliable(one: Measured) -> Measured:
+    """The same fix a millimetre off, whose lengths contradict each other."""
+    moved = shifted(one, 1e-3)
+    return Measured(one.point, replace(moved.fix, metrology="unreliable", suspects=(1, 2, 3, 4)))
+
+
+def test_points_whose_lengths_contradict_each_other_do_not_move_a_panel() -> None:
+    measured = exact()
+    some = result_of([unreliable(one) if k < 4 else one for k, one in enumerate(measured)])
+    assert some.panels[0].fit.values == pytest.approx(result_of(measured[4:]).panels[0].fit.values, abs=1e-12)
+    assert some.warnings[0].startswith("not used, their lengths contradict each other: ")
+    none = result_of([unreliable(one) for one in measured])
+    assert none.panels == ()
+    assert none.undetermined[0].why == "the lengths of 9 of its 9 points contradict each other"
+    assert fit_panels(M1, [unreliable(one) for one in measured], HEIGHT_M) == {}
 
 
 def test_contradictions_beyond_outliers_are_told() -> None:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import namedtuple
 from collections.abc import Callable
+from dataclasses import replace
 from fcntl import LOCK_EX, flock
 from functools import cache
 from operator import mul
@@ -216,6 +217,24 @@ def test_a_fix_is_where_a_robot_at_base_has_its_puck() -> None:
     assert "puck_height_m" in fix(high).todo
     assert "set the robot down at base" in fix((at_base[0] + 0.4, at_base[1], at_base[2])).todo
     assert fix((1e3 * at_base[0], 1e3 * at_base[1], 1e3 * at_base[2])).outcome is FAIL  # millimetres
+
+
+def test_a_fix_whose_lengths_contradict_each_other_is_no_pass() -> None:
+    cfg, mirror, *_ = stood()
+    fix = Fix(0.0, mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m), (0.0,) * 9, 1.0, (1, 2, 3, 4), 1e-6)
+    for one, found in (
+        (replace(fix, metrology="good"), None),
+        (
+            replace(fix, metrology="unreliable", suspects=(2, 7)),
+            "the lengths contradict each other: channels 2 7",
+        ),
+        (replace(fix, metrology="good", left_out=(3,)), "left out: channels 3"),
+        (replace(fix, metrology="unchecked"), "too few lengths to contradict each other"),
+    ):
+        result = check_fix(cfg, mirror, one)
+        assert (result.outcome is PASS) is (found is None), found
+        assert found is None or result.found.endswith(found)
+        assert bool(result.todo) is (found is not None)
 
 
 def test_the_table() -> None:

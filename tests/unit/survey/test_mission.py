@@ -99,6 +99,16 @@ def test_abort_goes_home_from_every_state(story: Story, state: MissionState) -> 
     assert story.motion().deck.heading_rad == pytest.approx(1.0, abs=0.011)  # heading tolerance and 1e-3 of frames
 
 
+def test_a_robot_that_is_held_because_the_laser_does_not_follow_goes_home_by_odometry(story: Story) -> None:
+    story.auto_fix = False
+    story.until_state(MissionState.MEASURING)
+    story.mission.handle(Fault("the laser does not follow the robot"))
+    assert story.state.is_faulted
+    story.mission.handle(Abort("operator"))
+    story.until_state(MissionState.DONE)
+    assert story.state.outcome is SurveyOutcome.AT_BASE
+
+
 def test_edge_backs_off_at_most_60_mm_turns_away_fixes_and_resumes(story: Story, config: Config) -> None:
     story.drive_on()
     start = (story.x, story.y)
