@@ -56,7 +56,7 @@ def test_after_a_gap_of_samples_the_robot_is_located_before_it_moves(
 
 
 @pytest.mark.fault("S31")
-@pytest.mark.parametrize(("by_s", "at_s"), [*product((-5.0, 0.4, 5.0), (DRIVING_S, TURNING_S))])
+@pytest.mark.parametrize(("by_s", "at_s"), [*product((-5.0, 0.4), (DRIVING_S, TURNING_S))])
 def test_samples_of_impossible_times_are_a_gap(by_s: float, at_s: float, measured: Measured) -> None:
     clocks = (f"{sensor}_clock jump by_s={by_s}" for sensor in ("encoder", "edge"))
     worst_mm = worst_arrival_mm(at_s, 1.9, *clocks)
@@ -65,10 +65,12 @@ def test_samples_of_impossible_times_are_a_gap(by_s: float, at_s: float, measure
 
 
 @pytest.mark.fault("F11")
-@pytest.mark.parametrize("factor", [0.5, 0.75, 1.25, 1.5])
-@pytest.mark.parametrize("signals", [("right_wheel", "left_wheel"), ("left_wheel",)], ids=["both", "one"])
+@pytest.mark.parametrize(
+    ("factor", "signals"),
+    [*product((0.5, 0.75, 1.25, 1.5), [("right_wheel", "left_wheel")]), (1.25, ("left_wheel",))],
+)
 def test_wheels_that_turn_at_a_wrong_multiple_are_held(
-    signals: tuple[str, ...], factor: float, measured: Measured
+    factor: float, signals: tuple[str, ...], measured: Measured
 ) -> None:
     faults = (f"{signal} gain at_s=1.0 factor={factor}" for signal in signals)
     run = watched(HARD, lambda one: one.verdict.severity >= Severity.HOLD or one.t_s > 12.0, *faults)
