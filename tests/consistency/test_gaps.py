@@ -17,7 +17,7 @@ def wrong(cells: list[Cell]) -> list[str]:
 
 @ROW
 def test_a_few_gaps_of_all_encoders(measured: Measured) -> None:
-    """Some seeds of the campaign. Before there was a prediction, the mean NEES of these cells was above 600."""
+    """Some seeds of the campaign."""
     ways, silent = (Way("leg", "rule"), Way("turn", "ttl")), ("", "enc", "imu+enc+edge")
     drives = [run(Drive("hard", "lag"), seed, ways, silent) for seed in range(3)]
     cells = cells_of(Drive("hard", "lag"), drives)
