@@ -271,6 +271,11 @@ EDGE_SENSOR_STAYS_DARK = slow(Group.SENSORS, "an edge sensor went off though not
 IMU_LEFT_OUT = slow(Group.SENSORS, "{what}: left out",
     "Readings of the inertial unit are impossible (stuck, at their limit, a jump). It is not used: wheels alone, at "
     "half the speed.", "The accuracy is lower. Replace it if this does not end.")
+ACCELEROMETER_DIFFERENCES = inform(Group.SENSORS,
+    "the accelerometer's samples are single differences, no means: they show contacts as motion",
+    "More than twenty jumps in speed within about 20 s that the next sample does not take back. A slide counts with at "
+    "most 2 m/s² and against the noise, so it is found later; the position is less accurate.",
+    "The robot's firmware must send `ax` as a mean over at least the time between two samples.")
 SAMPLES_TOO_FEW = slow(Group.SENSORS, "a sensor gives too few samples",
     "One sensor is slower than usual. The robot continues at half its speed.", "See the robot's own log.")
 

@@ -266,45 +266,6 @@ def twist_of(right_rad_s: float, left_rad_s: float, wheel_radius_m: float, wheel
     )
 
 
-_LEAST_SHARE = 0.3  # least part of the slip limit, because a difference in turning alone is no slide
-
-
-class SlideRule:
-    """Detects loss of grip: the body moves downhill faster than its wheels.
-
-    The differences between body and wheels in speed and in angle are summed with a memory of 60 ms, and compared with
-    the limits ``slip_m_s`` and ``turn_rad``. The larger the difference in angle, the smaller the slip that is allowed.
-    """
-
-    MEMORY_S = 0.06
-    LEAST_SLOPE = 0.15  # least component of the unit gravity along the surface with which the robot can slide
-    LARGEST_M_S2 = 10.0  # gravity cannot cause a larger acceleration
-    WHEEL_JUMP_M_S = 0.03  # larger than any change in 10 ms of the speed of a wheel with load
-    BIAS_SAMPLES = 50  # accelerometer samples at rest whose mean is its bias
-
-    def __init__(self, slip_m_s: float, turn_rad: float) -> None:
-        self.slip_m_s, self._turn_rad = slip_m_s, turn_rad
-        self._ahead_m_s = self._left_m_s = self._turned_rad = 0.0
-
-    def reset(self) -> None:
-        """Drop the sums of the last 60 ms."""
-        self._ahead_m_s = self._left_m_s = self._turned_rad = 0.0
-
-    def step(self, dt_s: float, ahead_m_s: float, left_m_s: float, turned_rad: float, downhill: Vector2) -> float:
-        """Take the differences, body minus wheels, within ``dt_s``; returns the slide downhill, m/s, 0 without one.
-
-        ``downhill``: unit vector, robot frame; zeros without a slope.
-        """
-        keep = self.MEMORY_S / (self.MEMORY_S + dt_s)
-        self._ahead_m_s = keep * (self._ahead_m_s + ahead_m_s)
-        self._left_m_s = keep * (self._left_m_s + left_m_s)
-        self._turned_rad = keep * (self._turned_rad + turned_rad)
-        downhill_m_s = self._ahead_m_s * downhill[0] + self._left_m_s * downhill[1]
-        share = downhill_m_s / self.slip_m_s
-        slides = share >= _LEAST_SHARE and share + abs(self._turned_rad) / self._turn_rad >= 1.0
-        return downhill_m_s if slides else 0.0
-
-
 # Unit of the value, by the signal. A signal with values of several kinds has none; a stale or missing one has an age.
 _UNITS = dict.fromkeys(("estimate", "sensors", "enc", "frames", "clock", "latency", "radio"), "s") | {
     "encoders": "m/s",

@@ -435,6 +435,11 @@ class PhysicsConfig(Model):
     mass_kg: Annotated[float, Field(gt=0.2, le=10.0)]
     thrust_n: NonNegative
     rotor_inertia_kg_m2: NonNegative
+    tyre_width_m: Annotated[float, Field(ge=0.001, le=0.05)]
+    pivot_m: Annotated[float, Field(ge=0.0, le=0.02)]
+    caster_friction: Annotated[float, Field(ge=0.0, le=1.0)]
+    contact_s: Annotated[float, Field(ge=0.004, le=0.1)]
+    accelerometer_s: Annotated[float, Field(gt=0.0, le=0.1)]
 
 
 class SimEtalonConfig(Model):

@@ -9,8 +9,9 @@ from collections import deque
 from math import hypot, inf, isfinite
 from typing import Any, Literal
 
-from ccatp.core import SlideRule, twist_of
+from ccatp.core import twist_of
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role
+from ccatp.slide_rule import SlideRule
 
 HELD = (0.0, 0.0)
 _EVERYTHING = (True, True, True)
@@ -151,7 +152,7 @@ class SlideMonitor:
         wheels = twist_of((right - last[1]) / dt_s, (left - last[2]) / dt_s, self._radius_m, self._base_m)
         change_m_s, self._speed_m_s = wheels.v_m_s - self._speed_m_s, wheels.v_m_s
         self._count += 1
-        if max(abs(ax), abs(ay)) > rule.LARGEST_M_S2 or abs(change_m_s) > rule.WHEEL_JUMP_M_S:
+        if not rule.is_possible(max(abs(ax), abs(ay))) or abs(change_m_s) > rule.WHEEL_JUMP_M_S:
             rule.reset()
             return False
         excess = ax - change_m_s / dt_s, ay - wz * wheels.v_m_s, wz - wheels.omega_rad_s

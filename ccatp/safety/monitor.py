@@ -239,7 +239,13 @@ class HealthMonitor:
         for latch in self._latches:
             if latch.finding is not None and (finding := latch.settle(t_s)) is not None:
                 found.append(finding)
-        for other in (self._grip.finding, self._rates.finding, self._battery.finding, self._seams.finding):
+        for other in (
+            self._grip.finding,
+            self._grip.noise,
+            self._rates.finding,
+            self._battery.finding,
+            self._seams.finding,
+        ):
             if other is not None:
                 found.append(other)
         gate = self._gate

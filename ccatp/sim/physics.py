@@ -23,21 +23,20 @@ from ccatp.sim.hardware import Motor, SimulatedHardware
 from ccatp.sim.plant import Plant
 from ccatp.sim.world import World
 
-_TYRE_M = 0.012  # width of a flat tyre
 _TYRE_PRIORITY = 2  # of contacts: the tyre's friction is used, not the mirror's
-_AVERAGED = 5  # steps over which the accelerations are averaged
 
 _MODEL = """
 <mujoco model="survey robot">
   <option timestep="{timestep}" integrator="implicitfast" cone="elliptic" noslip_iterations="4" impratio="10"
           gravity="{gravity}"/>
-  <default><geom solref="0.01 1" solimp="0.95 0.99 0.0005" condim="4"/></default>
+  <default><geom solref="{contact_s} 1" solimp="0.95 0.99 0.0005" condim="4"/></default>
   <worldbody>
     <geom name="mirror" type="plane" size="0 0 1" pos="0 0 -1" euler="1 1 1" friction="{friction} 0.002 0.0001"/>
     <body name="robot">
       <freejoint/>
       <geom type="box" size="0.09 0.06 0.015" pos="-0.015 0 0.035" mass="{chassis_kg}" contype="0" conaffinity="0"/>
-      <geom name="caster" type="sphere" size="0.012" pos="-0.075 0 0.012" mass="0.02" friction="0.02 0 0" priority="1"/>
+      <geom name="caster" type="sphere" size="0.012" pos="-0.075 0 0.012" mass="0.02" priority="1"
+            friction="{caster} 0 0"/>
       <site name="centre"/>
       {wheels}
     </body>
@@ -53,11 +52,11 @@ _WHEEL = """
       </body>"""
 _ROUND = (
     '<geom type="ellipsoid" size="{radius} {radius} 0.004" euler="90 0 0" mass="0.04" '
-    'friction="{friction} 0.001 0.0001" priority="{priority}"/>'
+    'friction="{friction} {pivot} 0.0001" priority="{priority}"/>'
 )
 _FLAT = (
     '<geom type="cylinder" size="{radius} {half}" euler="90 0 0" mass="0.04" '
-    'friction="{friction} 0.001 0.0001" priority="{priority}"/>'
+    'friction="{friction} {pivot} 0.0001" priority="{priority}"/>'
 )
 
 
@@ -89,7 +88,8 @@ class PhysicsPlant(Plant):
         self._body = self._model.body("robot").id
         self.thrust_n = 0.0
         self.has_left = False
-        self._speeds = [(0.0, 0.0)] * (_AVERAGED + 1)
+        self._averaged = max(1, round(cfg.sim.physics.accelerometer_s / step_s))
+        self._speeds = [(0.0, 0.0)] * (self._averaged + 1)
         self._rate_rad_s = 0.0
         self.place(start.x_m, start.y_m, start.heading_rad)
         self.are_wheels_still = False
@@ -98,8 +98,9 @@ class PhysicsPlant(Plant):
         motor = self._motor
         damping = motor.volt_per_rad_s / motor.volt_per_nm
         tyre = (_FLAT if cfg.tyre == "flat" else _ROUND).format(
-            radius=radius_m, half=0.5 * _TYRE_M, friction=cfg.friction, priority=_TYRE_PRIORITY
-        )
+            radius=radius_m, half=0.5 * cfg.tyre_width_m, friction=cfg.friction, pivot=cfg.pivot_m,
+            priority=_TYRE_PRIORITY,
+        )  # fmt: skip
         wheels = "".join(
             _WHEEL.format(
                 name=name, y=y, radius=radius_m, tyre=tyre, damping=damping, friction_nm=motor.friction_nm,
@@ -111,7 +112,8 @@ class PhysicsPlant(Plant):
             _MODEL.format(
                 timestep=self._step_s,
                 gravity=" ".join(f"{GRAVITY_M_S2 * one:.9g}" for one in self._mirror.gravity_deck),
-                friction=cfg.friction, chassis_kg=cfg.mass_kg - 0.1, wheels=wheels,
+                friction=cfg.friction, chassis_kg=cfg.mass_kg - 0.1, wheels=wheels, caster=cfg.caster_friction,
+                contact_s=cfg.contact_s,
             )
         )  # fmt: skip
 
@@ -163,13 +165,13 @@ class PhysicsPlant(Plant):
         self._rate_rad_s = float(data.qvel[5])
 
     def acceleration_at(self, decay: float) -> float:
-        """Acceleration along robot x over the last steps, m/s^2."""
-        return (self._speeds[-1][0] - self._speeds[0][0]) / (_AVERAGED * self._step_s)
+        """Mean acceleration along robot x over ``sim.physics.accelerometer_s``, m/s^2."""
+        return (self._speeds[-1][0] - self._speeds[0][0]) / (self._averaged * self._step_s)
 
     def lateral_acceleration_at(self, decay: float) -> float:
         """The same along robot y."""
         (_, before), (ahead, now) = self._speeds[0], self._speeds[-1]
-        return (now - before) / (_AVERAGED * self._step_s) + self._rate_rad_s * ahead
+        return (now - before) / (self._averaged * self._step_s) + self._rate_rad_s * ahead
 
     def turn_rate_at(self, decay: float) -> float:
         """Angular rate about robot z, rad/s."""

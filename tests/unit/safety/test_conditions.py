@@ -306,7 +306,12 @@ ELSEWHERE = {
         *(rows.ALL_OFF, rows.EARTHQUAKE, rows.EMERGENCY),
     ),
     "tests/unit/safety/test_sample_times.py": (rows.SAMPLES_MISDATED,),
-    "tests/unit/safety/test_grip.py": (rows.GRIP_LOST, rows.GRIP_LITTLE, rows.GRIP_TOO_LITTLE),
+    "tests/unit/safety/test_grip.py": (
+        rows.GRIP_LOST,
+        rows.GRIP_LITTLE,
+        rows.GRIP_TOO_LITTLE,
+        rows.ACCELEROMETER_DIFFERENCES,
+    ),
     "tests/unit/beacons/test_mission.py": tuple(row for row in DANGER if row.group is Group.BEACONS),
 }
 
