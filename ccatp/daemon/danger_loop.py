@@ -263,6 +263,7 @@ class DangerLoop(RobotLoop):
         news = verdict.code, verdict.cause, verdict.severity, names
         if news == self._published:
             return
+        is_verdict_new = news[:3] != self._published[:3]
         self._published = news
         active = [ActiveCause(one.condition.name, one.cause, one.severity) for one in found]
         others = dict.fromkeys((verdict.cause, *emergencies))
@@ -272,7 +273,8 @@ class DangerLoop(RobotLoop):
         listed = [(name, cause, int(severity)) for name, cause, severity in active]
         event = DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, active=listed, **fields)
         self.publisher.send("danger_event", event)
-        self.log.info("verdict_changed", seq=verdict.seq, t_s=verdict.t_s, **fields)
+        if is_verdict_new:  # otherwise only other findings began or ended; the list of alarms has them
+            self.log.info("verdict_changed", seq=verdict.seq, t_s=verdict.t_s, **fields)
 
 
 def main() -> int:

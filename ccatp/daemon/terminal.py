@@ -59,6 +59,7 @@ class RunView:
         self._is_terminal = self._console.is_terminal and not self._is_quiet
         self._rate_limit = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
         self._has_pose = False
+        self._verdict = (0, "", 0)  # code, cause and severity of the last event of danger
         self._shown_tenths = 0
         title, self._goals = _title_and_goals(cfg, is_sim=is_sim)
         if not self._is_quiet:
@@ -101,10 +102,17 @@ class RunView:
             self._show_status(message)
         elif isinstance(message, LogMessage):
             self.show_message(message.level, message.text)
-        elif isinstance(message, DangerEvent) and (message.code or message.severity in SHOWN):
+        elif isinstance(message, DangerEvent):
+            self._show_danger(message)
+
+    def _show_danger(self, message: DangerEvent) -> None:
+        """Show a verdict that is new; an event also reports that further findings began or ended."""
+        verdict = message.code, message.cause, message.severity
+        if verdict != self._verdict and (message.code or message.severity in SHOWN):
             text = danger_text(message.cause, message.signal, message.value, message.limit)
             what = f"code {message.code}" if message.code else Severity(message.severity).name.lower()
             self.show_message("warning", f"danger: {what}, {text}, at {message.t_s:.2f} s")
+        self._verdict = verdict
 
     def _show_status(self, status: MissionStatus) -> None:
         text = self.text_of(status)

@@ -82,6 +82,20 @@ def test_danger_is_shown_where_it_holds_the_robot_without_a_code(
     assert shown == [f"warning: danger: {word}" for word in ("slow", "hold", "return", "fault")]
 
 
+def test_a_verdict_is_shown_again_only_after_another_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    view = RunView(CFG, is_sim=True, run_dir=tmp_path)
+    stale = DangerEvent(
+        seq=1, t_s=2.0, code=0, cause="encoder samples stale", signal="enc", value=0.151, limit=0.15, off=(False,) * 4,
+        severity=4,
+    )  # fmt: skip
+    normal = replace(stale, cause="", signal="", severity=0)
+    also_other = replace(stale, t_s=2.1, value=0.251, active=[("edge_stale", "edge samples stale", 3)])
+    for event in (stale, also_other, replace(stale, t_s=2.2), replace(stale, severity=6), normal, stale):
+        view.show(event)
+    shown = [line.split(", ")[0] for line in capsys.readouterr().err.splitlines()[1:]]
+    assert shown == ["warning: danger: hold", "warning: danger: fault", "warning: danger: hold"]
+
+
 def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     survey = RunView(CFG, is_sim=False, run_dir=tmp_path)
     at_point = replace(STATUS, point="1-2-3", error_mm=0.5)
