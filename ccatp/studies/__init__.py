@@ -27,6 +27,7 @@ STUDIES = {
     "sensitivity": ("survey_studies:SENSITIVITY", "what each disturbance of a hard world costs"),
     "ablation": ("survey_studies:ABLATION", "what each technique gives, one off at a time"),
     "physics": ("physics_study:PHYSICS", "a rigid body on both mirrors: tyre, friction, thrust"),
+    "bodies": ("physics_study:BODIES", "a rigid body with drawn tyres, contacts and accelerometer"),
     "stops": ("physics_study:STOPS", "a rigid body at the rim and on command: overrun by speed"),
     "slides": ("physics_study:SLIDES", "a rigid body whose friction falls: when that is found"),
     "danger": ("danger_study:STUDY", "false edges and overrun of two edge rules"),

@@ -1,14 +1,18 @@
 """The studies with rigid-body physics.
 
 `physics`: whole missions with different tyres, friction and thrust. `stops`: drives over the rim, and stops by command.
-`slides`: the friction falls while the robot drives or turns.
+`slides`: the friction falls while the robot drives or turns. `bodies`: missions of bodies whose unknown properties are
+drawn.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 from math import ceil, cos, hypot, pi, sin
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
@@ -79,6 +83,41 @@ PHYSICS = Study(
     mirrors=(),
     runs=1,
 )
+
+# Properties of a body that a builder hardly knows, and the range from which each is drawn, in proportion (log-uniform).
+BODY_RANGES = {
+    "accelerometer_s": (0.002, 0.02),
+    "tyre_width_m": (0.006, 0.014),
+    "pivot_m": (0.0005, 0.002),
+    "caster_friction": (0.01, 0.1),
+    "contact_s": (0.01, 0.03),
+}
+
+
+def drawn_body(number: int) -> dict[str, float]:
+    """Configuration keys of a body; each ``number`` always gives the same one."""
+    rng = np.random.default_rng(number)
+    return {
+        f"sim.physics.{name}": round(float(np.exp(rng.uniform(np.log(low), np.log(high)))), 5)
+        for name, (low, high) in BODY_RANGES.items()
+    }
+
+
+def body_cells() -> Sequence[Cell]:
+    """Mirror, tyre, and number of the body, at a friction of 0.8 and 1.3 times the least thrust."""
+    return [
+        Cell({"mirror": name, "tyre": tyre, "body": number}, {**robot_keys(name, tyre, 0.8, 1.3), **drawn_body(number)})
+        for name, tyre, number in product(MIRRORS, TYRES_M, range(1, 9))
+    ]
+
+
+def draw_bodies(cells: Sequence[CellResult], out: Path) -> None:
+    """Errors and time: a figure for each mirror."""
+    for (mirror,), there in grouped(cells, "mirror").items():
+        draw_ranges(rows_by(there, "tyre", "body"), MISSION, f"{mirror}, by body: {SHOWN}", out / f"bodies-{mirror}")
+
+
+BODIES = replace(PHYSICS, cells=body_cells, draw=draw_bodies)
 
 # -- single drives ----------------------------------------------------------------------------------------------------
 

@@ -400,3 +400,25 @@ def test_less_friction_than_promised_is_found_by_the_creep_of_turns() -> None:
     assert found.summary["danger"]["falls"] == 0
     assert 0.35 < found.summary["grip"]["friction"] < 0.5
     assert found.summary["grip"]["margin"] < 1.25
+
+
+def turn_of(**physics: object) -> tuple[float, float]:
+    """Heading after a turn on the spot on flat tyres, rad, and the largest acceleration in it, m/s^2."""
+    hardware, t_s, largest_m_s2 = robot("fyst-m1", (0.2, 0.2), tyre="flat", **physics), 0.0, 0.0
+    for _ in range(100):
+        t_s = run(hardware, 0.01, 3.0, -3.0, t_s)
+        largest_m_s2 = max(largest_m_s2, abs(hardware.plant.acceleration_at(0.0)))
+    return hardware.plant.heading_rad, largest_m_s2
+
+
+@pytest.mark.parametrize(
+    "changed", [{"tyre_width_m": 0.006}, {"pivot_m": 0.004}, {"caster_friction": 0.1}, {"contact_s": 0.03}]
+)
+def test_a_setting_of_the_body_changes_its_turns(changed: dict[str, float]) -> None:
+    assert abs(turn_of(**changed)[0] - turn_of()[0]) > 1e-4
+
+
+def test_single_differences_of_the_speed_contain_contacts() -> None:
+    (heading_rad, mean_m_s2), (same_rad, single_m_s2) = turn_of(), turn_of(accelerometer_s=0.002)
+    assert same_rad == heading_rad
+    assert single_m_s2 > 1.3 * mean_m_s2

@@ -28,6 +28,7 @@ from ccatp.studies.mission_study import (
     pooled,
     run_mission,
 )
+from ccatp.studies.physics_study import BODY_RANGES, body_cells, drawn_body
 from ccatp.studies.results import columns_of, plain
 from ccatp.studies.sil_run import SilRun, SilTrace
 from ccatp.studies.survey_studies import GROUPS, SENSITIVITY, TIME, combine_filters
@@ -363,6 +364,7 @@ RUNS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     ),
     "faults": (("faults=random",), ("--mirror", "thesis-m1", *ONE_PANEL_ARGS), "faults"),
     "physics": (("mirror=fyst-m1", "tyre=flat", "friction=0.8", "margin=1.3"), ONE_PANEL_ARGS, "physics-fyst-m1-130"),
+    "bodies": (("mirror=fyst-m1", "tyre=flat", "body=2"), ONE_PANEL_ARGS, "bodies-fyst-m1"),
     "stops": (("mirror=fyst-m1", "tyre=round", "thrust=shipped", "speed=safe"), (), "stops-fyst-m1"),
     "slides": (("mirror=fyst-m1", "friction=0.1"), (), "slides"),
     "cricket": (("case=zigzag-printed,all-printed,batch-45-once",), (), "figure_11_12 figure_14 figure_9_10_13 ways"),
@@ -388,7 +390,10 @@ def has(cell: Any, key: str) -> bool:
     return True
 
 
-@pytest.mark.parametrize("name", CAMPAIGNS)
+# A mission with a rigid body takes a quarter of a minute, and that of ``physics`` is one as well.
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "bodies" else []) for name in CAMPAIGNS]
+)
 def test_a_study_writes_its_figures_and_all_that_its_table_shows(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -425,3 +430,16 @@ def test_cells_are_configurations_of_their_own(name: str) -> None:
     }:  # their jobs look at the factors
         assert len(set(configurations)) == len(configurations)
     assert len({str(cell.factors) for cell in cells}) == len(cells)
+
+
+def test_a_body_is_drawn_by_its_number_within_the_ranges() -> None:
+    cells = [cell for cell in body_cells() if (cell.factors["mirror"], cell.factors["tyre"]) == ("fyst-m1", "flat")]
+    drawn = [dict(cell.overrides) for cell in cells]
+    assert len(drawn) == 8
+    for number, keys in enumerate(drawn, 1):
+        own = drawn_body(number)
+        assert {name: keys[name] for name in own} == own == drawn_body(number)
+        physics = load_config(None, keys).sim.physics
+        for name, (low, high) in BODY_RANGES.items():
+            assert low <= getattr(physics, name) == own[f"sim.physics.{name}"] <= high
+    assert len({keys["sim.physics.accelerometer_s"] for keys in drawn}) == 8
