@@ -8,7 +8,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.blas import daxpy, ddot, dger, dscal, dtrsm, dtrsv
+from scipy.linalg.blas import daxpy, ddot, dscal, dtrsm, dtrsv
 from scipy.linalg.lapack import dposv, dpotrf
 
 from ccatp.core import FloatArray
@@ -92,7 +92,6 @@ class EkfSlam:
         v = self.vehicle_size
         self.mean, self.covariance = mean, covariance
         self._rows, self._columns, self._vehicle = covariance[:v], covariance[:, :v], mean[:v]
-        self._transposed = covariance.T  # BLAS writes in place only into contiguous columns
 
     def __deepcopy__(self, memo: dict[int, object]) -> "EkfSlam":
         """An independent copy, whose views refer to its own state."""
@@ -158,9 +157,12 @@ class EkfSlam:
         flat[index * (n + 1)] += variance
 
     def add_square(self, factor: float, vector: FloatArray) -> None:
-        """P <- P + factor vector vector^T, vector (n,); exactly symmetric if ``factor`` is a power of two."""
-        # Positional arguments, because keywords cost as much as the algebra; P^T, because BLAS stores columns.
-        dger(factor, vector, vector, 1, 1, self._transposed, 1, 1, 1)
+        """P <- P + factor vector vector^T, vector (n,); exactly symmetric."""
+        # Not by BLAS, which on some processors rounds the elements at the end of a column in another way.
+        square = np.multiply.outer(vector, vector)
+        if factor != 1.0:
+            square *= factor
+        self.covariance += square
 
     def update_row(
         self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf, knee: float = inf

@@ -410,7 +410,8 @@ def test_a_clock_that_wraps_does_not_count_in_the_mission_time(phase_s: float) -
     ("fault", "until_s", "done"),
     [
         (f"encoder_right stuck at_s={DRIVING_S} for_s=1.0 value=0.0", 22.0, 3),  # a hold and a fix
-        pytest.param(f"right_wheel blocked at_s={DRIVING_S} for_s=1.5", 20.0, 3, marks=pytest.mark.fault("F8")),
+        # A hold, a fix, and a leg that shows the heading again.
+        pytest.param(f"right_wheel blocked at_s={DRIVING_S} for_s=1.5", 22.0, 3, marks=pytest.mark.fault("F8")),
         (f"edge_front_left stuck at_s={DRIVING_S} for_s=1.5 value=0.0", 20.0, 3),  # a back-off and a fix
         (f"imu_wz garbage at_s={TURNING_S} for_s=2.0 beyond=0.0", 20.0, 4),
     ],
