@@ -233,8 +233,8 @@ def test_nobody_falls_and_what_passes_by_is_survived() -> None:
 
 # -- a robot that is not where it takes itself to be -------------------------------------------------------------------
 
-# The first panel lies at a corner. These meet the rim; most others find themselves before. How often they meet it depends
-# on the rounding of the processor.
+# The first panel lies at a corner. These meet the rim; most others find themselves before. How often they meet it
+# depends on the rounding of the processor.
 SEEDS = (22, 62, 69)
 
 

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,10 +46,8 @@ dashboard.enabled = false
 """
 
 
-@pytest.mark.slow
-@pytest.mark.fault("L15")
-@pytest.mark.parametrize("options", [OTHER_CLOCK, SLOW_SENSORS, RESTARTS], ids=["real time", "lockstep", "restart"])
-def test_a_panel_of_a_foreign_robot_is_surveyed(tmp_path: Path, runtime_dir: Path, options: str) -> None:
+def survey_of(options: str, tmp_path: Path, runtime_dir: Path) -> tuple[subprocess.CompletedProcess[str], Any]:
+    """The run of a panel with a foreign robot, and what the robot reports at its end."""
     command = [sys.executable, foreign_robot.__file__, "--port", "0", "--laser-port", "0", *options.split()]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as robot:
         try:
@@ -60,7 +59,22 @@ def test_a_panel_of_a_foreign_robot_is_surveyed(tmp_path: Path, runtime_dir: Pat
             run = subprocess.run(survey, capture_output=True, text=True, timeout=600.0, check=False)
         finally:
             robot.terminate()
-        truth = json.loads(robot.stdout.read())
+        return run, json.loads(robot.stdout.read())
+
+
+def test_another_robot_in_the_middle_of_a_mission_ends_it_with_status_4(tmp_path: Path, runtime_dir: Path) -> None:
+    run, truth = survey_of("--restart-at-s 6 --other-base-m 0.3", tmp_path, runtime_dir)
+    assert truth["counts"]["restarts"] == 1
+    assert run.returncode == 4, run.stderr
+    assert "in the middle of the mission: robot: the configuration is not of this robot: wheel_base_m" in run.stderr
+    assert (tmp_path / "run" / "summary.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.fault("L15")
+@pytest.mark.parametrize("options", [OTHER_CLOCK, SLOW_SENSORS, RESTARTS], ids=["real time", "lockstep", "restart"])
+def test_a_panel_of_a_foreign_robot_is_surveyed(tmp_path: Path, runtime_dir: Path, options: str) -> None:
+    run, truth = survey_of(options, tmp_path, runtime_dir)
     assert run.returncode == 0, run.stderr
     assert run.stderr.count("the robot restarted: relocalizing before it moves") == truth["counts"]["restarts"]
     assert truth["counts"]["restarts"] == ("restart" in options)

@@ -74,6 +74,7 @@ class Options:
     drop_every_s: float = 0.0  # one session is reset
     restart_at_s: float = 0.0  # it restarts once, with the same boot number, as firmware does that does not count ...
     restart_s: float = 0.5  # ... and is away for this long
+    other_base_m: float = 0.0  # wheel base in the hello after the restart: another robot answers; 0: the same one
     blocked_beams: float = 0.0  # probability that a channel of the laser has no beam
     lose_replies: float = 0.0  # probability that a laser reply never comes
     laser_ready_after_s: float = 0.0
@@ -401,6 +402,12 @@ class RobotServer:
                 self.leave(session)
             writer.close()
 
+    @property
+    def wheel_base_m(self) -> float:
+        """That of the robot that answers now."""
+        is_other = self.o.other_base_m > 0.0 and self.counts["restarts"] > 0
+        return self.o.other_base_m if is_other else self.o.wheel_base_m
+
     def hello(self) -> dict[str, Any]:
         return {
             "type": "hello",
@@ -413,7 +420,7 @@ class RobotServer:
             "ttl_s": self.o.ttl_s,
             "robot": {
                 "wheel_radius_m": self.o.wheel_radius_m,
-                "wheel_base_m": self.o.wheel_base_m,
+                "wheel_base_m": self.wheel_base_m,
                 "edge_sensors_m": Body.SENSORS,
                 "puck_m": Body.PUCK,
                 "max_wheel_rad_s": 8.0,
