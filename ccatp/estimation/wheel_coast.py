@@ -50,7 +50,7 @@ class CoastedMotion(NamedTuple):
 
 
 WheelInput = SetPoints | CoastedMotion | None
-"""What a localizer is told about the wheels besides samples: set points, or in a replay the motion predicted then."""
+"""Input of a localizer about the wheels besides samples: set points, or in a replay the motion predicted then."""
 
 
 class WheelCoast:

@@ -87,6 +87,7 @@ def attack(kind: str, count: int, rng: np.random.Generator) -> Walk:
     cfg, mirror = world.cfg, world.mirror
     collimators = dict(zip(mirror.channels, np.asarray(mirror.collimators_m), strict=True))
     judge, follow = FixJudge(cfg.etalon, collimators), LaserFollow(cfg)
+    driver = Driver(follow)
     channels = sorted(rng.choice(mirror.channels, count, replace=False).tolist())
     all_places = places(mirror, HEIGHT_M)
     start = int(rng.integers(0, len(all_places) - 12))
@@ -124,7 +125,7 @@ def attack(kind: str, count: int, rng: np.random.Generator) -> Walk:
             refused += 1
             continue
         if number:
-            move(follow)
+            driver.move()
         follow.begin()
         if follow.doubt(fix):
             is_followed = False
@@ -138,26 +139,28 @@ def attack(kind: str, count: int, rng: np.random.Generator) -> Walk:
     return Walk(fixes, worst, refused, is_followed)
 
 
-def move(follow: LaserFollow) -> None:
-    """A turn and a leg of 0.25 m."""
-    t_s = getattr(move, "t_s", 0.0)
-    for _ in range(200):
-        t_s += 0.01
-        follow.add([(t_s, 0.0, 0.5)], [(t_s, 0.0, 0.0)])
-    for _ in range(200):
-        t_s += 0.01
-        follow.add([(t_s, 0.0, 0.0)], [(t_s, 5.0, 5.0)])
-    move.t_s = t_s  # type: ignore[attr-defined]
+class Driver:
+    """Gives samples of motion to a test of the laser, with times that rise."""
+
+    def __init__(self, follow: LaserFollow) -> None:
+        self._follow, self._t_s = follow, 0.0
+
+    def move(self) -> None:
+        """A turn, then a leg."""
+        for rate_rad_s, wheel_rad_s in ((0.5, 0.0), (0.0, 5.0)):
+            for _ in range(200):
+                self._t_s += 0.01
+                self._follow.add([(self._t_s, 0.0, rate_rad_s)], [(self._t_s, wheel_rad_s, wheel_rad_s)])
 
 
 def verdict(walk: Walk) -> str:
     """Silently wrong: a fix that counts as good is wrong beyond its limit, and nothing was said in the walk."""
-    is_told = (
+    is_reported = (
         walk.refused
         or not walk.is_followed
         or any(fix.warnings or fix.left_out or fix.metrology != "good" for fix in walk.fixes)
     )
-    if is_told:
+    if is_reported:
         return "reported, a fix is wrong" if walk.worst > 1.0 else "handled"
     return "silently wrong" if walk.worst > 1.0 else "within its limits"
 
@@ -178,12 +181,12 @@ def test_attacks_on_lengths(seed: int, count: int, measured: Measured) -> None:
 def test_a_laser_at_rest_is_certain_at_the_third_standstill_and_never_used() -> None:
     follow = LaserFollow(config_of())
     fix = Fix(0.0, (1.0, 2.0, 3.0), (1e-12, 0, 0, 0, 1e-12, 0, 0, 0, 1e-12), 1.0, (1, 2, 3, 4), 0.0)
-    told = []
+    driver, found = Driver(follow), []
     for _ in range(3):
         follow.begin()
-        told.append((bool(follow.doubt(fix)), follow.is_certain))
-        move(follow)
-    assert told == [(False, False), (True, False), (True, True)]
+        found.append((bool(follow.doubt(fix)), follow.is_certain))
+        driver.move()
+    assert found == [(False, False), (True, False), (True, True)]
     follow.begin()
     elsewhere = Fix(0.0, (1.0, 2.3, 3.0), fix.covariance_m2, 1.0, fix.channels, 0.0)
     assert not follow.doubt(elsewhere)  # what releases it

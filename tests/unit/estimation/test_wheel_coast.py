@@ -217,7 +217,7 @@ def stamped(frame: Frame, by_s: float) -> Frame:
 
 @pytest.mark.parametrize("by_s", [-5.0, -0.5, 0.012, 0.4, 5.0])
 def test_samples_with_an_impossible_time_stamp_are_a_gap(by_s: float) -> None:
-    """They are left out, and the localizer takes the drives; the body was not told, so it may have stopped at once."""
+    """They are left out. Its set points are unknown, so the body may have stopped at once."""
     localizer, robot = driving(800)
     known_m = localizer.position_sigma_m
     for frame in robot.frames(0.3):

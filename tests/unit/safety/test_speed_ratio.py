@@ -31,8 +31,8 @@ def drive(
 ) -> tuple[SpeedRatioMonitor, list[float], float]:  # fmt: skip
     """The monitor after some frames, all ratios that it found, and the time until its finding (infinite: none).
 
-    The right wheel turns ``ratio`` times as fast as told from a frame on. ``lag``: the servo's time constant over the
-    configured one; ``delay``: frames until a set point acts; ``clock``: rate of the robot's clock.
+    The right wheel turns ``ratio`` times as fast as commanded from a frame on. ``lag``: the servo's time constant over
+    the configured one; ``delay``: frames until a set point acts; ``clock``: rate of the robot's clock.
     """
     monitor, source = SpeedRatioMonitor(CFG.health, CFG.robot), legs(speed_m_s, 0.2, cruise_s)
     keep = exp(-FRAME_S * clock / (LAG_S * lag))
