@@ -160,7 +160,6 @@ class MainLoop(RobotLoop):
         again = " again" if self.sessions > 1 else ""
         robot = self.robot_cfg
         self._telemetry.notify_operator("info", f"joined the robot at {robot.host}:{robot.port}{again}")
-        self._telemetry.begin_session(hello.boot, self.link.session)
 
     def on_restarted(self) -> None:
         self._telemetry.notify_operator("warning", "the robot restarted: relocalizing before it moves")
@@ -405,6 +404,8 @@ class MainLoop(RobotLoop):
     def _begin_drives(self, unseen_s: float) -> None:
         """Begin the drives of a session: here and not on joining, so that in lockstep the frame is always the same."""
         self._is_new_session = False
+        if self.hello is not None:  # with the first frame, because only then a restart is known
+            self._telemetry.begin_session(self.hello.boot, self.link.session)
         self._runner.begin_drives()
         if unseen_s > UNSEEN_S and not self._was_at_rest:
             text = f"the robot moved and sent no frame for {unseen_s:.2f} s: relocalizing"
