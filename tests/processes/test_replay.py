@@ -84,7 +84,6 @@ at_s = 70.0
 """
 
 
-@pytest.mark.slow
 @pytest.mark.fault("P25")
 def test_a_run_with_restarts_and_steps_of_the_clock_is_read_as_it_was(
     start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str], measured: Measured
