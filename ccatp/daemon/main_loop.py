@@ -320,7 +320,9 @@ class MainLoop(RobotLoop):
         status.since_s = self._runner.since_s
         if verdict is not None:
             status.code, status.severity = int(verdict.code), int(verdict.severity)
-        status.exit_status = int(self.exit_status) if self.over.is_set() else -1
+        # The end of a process that failed is no end of the mission: another takes over, or its own status says why.
+        is_over = self.over.is_set() and self._failure is None
+        status.exit_status = int(self.exit_status) if is_over else -1
         status.missed_deadlines = lateness.missed_deadlines
         status.worst_lateness_ms = round(1e3 * lateness.worst_s, 3)
         status.alarms = self.alarms.alarms

@@ -1,0 +1,42 @@
+"""What the main loop publishes as the end of the run."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+import zmq
+
+from ccatp.config.load import load_config
+from ccatp.daemon.main_loop import MainLoop
+from ccatp.daemon.mission_runner import MissionRunner
+from ccatp.daemon.process import Endpoints, ProcessArgs
+from ccatp.errors import ConfigError, ExitStatus
+from ccatp.links.topics import MissionStatus
+
+
+@pytest.fixture
+def loop(tmp_path: Path) -> Iterator[MainLoop]:
+    config = load_config(None, {})
+    args = ProcessArgs(config, tmp_path, Endpoints(tmp_path), None, is_realtime=False, is_resuming=False)
+    runner = SimpleNamespace(status=lambda: MissionStatus(seq=0, t_s=0.0, state="survey"), since_s=0.0, telemetry=None)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    made = MainLoop(args, context, lambda _: cast(MissionRunner, runner))
+    with closing(made.publisher), closing(made._verdicts), closing(made._danger_events):
+        yield made
+    context.destroy(linger=0)
+
+
+def test_a_run_that_ended_publishes_its_status(loop: MainLoop) -> None:
+    assert loop.status().exit_status == -1
+    loop.finish(ExitStatus.HELD)
+    assert loop.status().exit_status == ExitStatus.HELD
+
+
+def test_a_process_that_failed_publishes_no_end_of_the_run(loop: MainLoop) -> None:
+    # Otherwise the run would end before the supervisor has seen the status of the process, or restarted it.
+    loop._fail(ConfigError("the configuration is not of this robot"))
+    assert loop.over.is_set()
+    assert loop.status().exit_status == -1
