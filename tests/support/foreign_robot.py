@@ -72,8 +72,8 @@ class Options:
     stall_every_s: float = 0.0  # frames stop ...
     stall_s: float = 0.1  # ... for this long, and then come at once
     drop_every_s: float = 0.0  # one session is reset
-    restart_at_s: float = 0.0  # it restarts once, with the same boot number, as firmware does that does not count ...
-    restart_s: float = 0.5  # ... and is away for this long
+    restart_at_s: float = 0.0  # after its first motion; it restarts once, with the same boot number ...
+    restart_s: float = 0.5  # ... as firmware without a counter does, and is away for this long
     other_base_m: float = 0.0  # wheel base in the hello after the restart: another robot answers; 0: the same one
     blocked_beams: float = 0.0  # probability that a channel of the laser has no beam
     lose_replies: float = 0.0  # probability that a laser reply never comes
@@ -355,6 +355,7 @@ class RobotServer:
         self.counts = {"frames": 0, "bad_lines": 0, "resets": 0, "stalls": 0, "held_s": 0.0, "lost": 0, "restarts": 0}
         self.held = True
         self.booted_s = self.away_until_s = 0.0  # of the body's time
+        self.moved_s = math.inf  # the first drive that turns the wheels
         self.last_bad = ""
 
     # motion rules
@@ -496,6 +497,8 @@ class RobotServer:
             return
         if kind == "drive":
             self.drive, self.echo = (now, message["wr"], message["wl"]), (seq, now)
+            if message["wr"] or message["wl"]:
+                self.moved_s = min(self.moved_s, now)
         else:
             self.permit = (now, message["forward"], message["reverse"], message["turn"])
         session.ack = message["ack"]
@@ -583,7 +586,7 @@ class RobotServer:
         next_drop = self.o.drop_every_s or math.inf
         while True:
             self.catch_up()
-            if self.o.restart_at_s and self.body.t > self.o.restart_at_s and not self.counts["restarts"]:
+            if self.o.restart_at_s and self.body.t > self.moved_s + self.o.restart_at_s and not self.counts["restarts"]:
                 self.restart()
             if self.body.t > next_drop:
                 next_drop += self.o.drop_every_s
