@@ -62,7 +62,8 @@ class FixJudge:
         ]
         self._left_out = left_out
         if found.w:
-            warnings += [one.text for one in self._watch.add(found.w, found.chi2, found.dof)]
+            constant = self._integrity.network.constant_errors()
+            warnings += [one.text for one in self._watch.add(found.w, found.chi2, found.dof, constant)]
         x, y, z = found.solution.position_m.tolist()
         covariance = found.solution.covariance_m2 + found.inconsistency_m**2 * np.eye(3)
         return Fix(

@@ -9,6 +9,10 @@ exist from the first fix on belong to that part and are no fault. What does not 
 fixes alike.
 
 The chi-squares of successive fixes are independent, so that a probability per survey divides by the number of fixes.
+
+An error of one channel that is larger than its prior and exists from the first fix on is calibrated away fix by fix.
+``constant_errors`` finds it: the likelihood ratio of such an error, with what the correction of the network makes of it
+in the later innovations (Willsky and Jones 1976).
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,6 +63,10 @@ class NetworkCalibration:
         self.covariance: FloatArray = np.diag(np.square([*sigmas, cfg.refraction_sigma]))
         self.mean: FloatArray = np.zeros(len(self.covariance))
         self._count = count
+        # Of a constant error of each channel: change of the mean per metre, and its score and information until now.
+        self._shifts: FloatArray = np.zeros((count, len(self.covariance)))
+        self._scores: FloatArray = np.zeros(count)
+        self._information: FloatArray = np.zeros(count)
 
     def design(self, rows: Sequence[int], directions: FloatArray, distances_m: FloatArray) -> FloatArray:
         """G (m, n): change of the lengths per error of the network; directions (m, 3) from collimators to puck."""
@@ -87,10 +95,27 @@ class NetworkCalibration:
     def correct(self, parity: Parity, innovation: FloatArray) -> None:
         """Correct the network by a good fix."""
         spread = self.covariance @ parity.design.T
-        gain = np.linalg.solve(parity.covariance, spread.T).T
+        gain: FloatArray = np.asarray(np.linalg.solve(parity.covariance, spread.T).T, dtype=np.float64)
+        self._score_constant_errors(parity, innovation, gain)
         self.mean = self.mean + innovation @ gain.T
         left = self.covariance - gain @ spread.T
         self.covariance = 0.5 * (left + left.T)
+
+    def _score_constant_errors(self, parity: Parity, innovation: FloatArray, gain: FloatArray) -> None:
+        shown = -self._shifts @ parity.design.T
+        shown[list(parity.rows)] += parity.basis
+        weighted = np.linalg.solve(parity.covariance, shown.T)
+        self._scores = self._scores + innovation @ weighted
+        self._information = self._information + np.sum(shown * weighted.T, axis=1)
+        self._shifts = self._shifts + shown @ gain.T
+
+    def constant_errors(self) -> tuple[FloatArray, FloatArray]:
+        """Errors of single channels since the first fix: standardised (standard normal without a fault), and in m.
+
+        Both (count,), or (runs, count).
+        """
+        information = np.maximum(self._information, 1e-30)
+        return np.asarray(self._scores / np.sqrt(information)), np.asarray(self._scores / information)
 
 
 def chi_square(parity: Parity, innovation: FloatArray) -> FloatArray:

@@ -1,26 +1,27 @@
-"""The running test of each channel over the fixes of a run: mean and drift of its residual, and the noise of all.
+"""The running tests over the fixes of a run: mean and drift of each channel's residual, and the noise of all.
 
 Input are the standardised errors of single channels (``length_integrity.standardised``), which are standard normal and
-independent from fix to fix as long as nothing changes. Two cumulative sums a channel and sign (Page 1954), for a step
-and for a slow drift, and the mean square of the last fixes. A deviation that exists from the first fix on, within the
-priors of the network, is calibrated and is not found here.
+independent from fix to fix as long as nothing changes. Cumulative sums (Page 1954): two a channel and sign, for a step
+and for a slow drift, and one for noise larger than configured. A deviation that exists from the first fix on is
+calibrated and does not show in them; beyond the priors it is found by ``NetworkCalibration.constant_errors``.
 """
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from math import log
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import ndtri
 
 from ccatp.config.models import EtalonConfig
 from ccatp.core import FloatArray
 from ccatp.mirror.length_integrity import SURVEY_FIXES
 
-WINDOW = 20  # fixes
+WINDOW = 20  # fixes without a second warning of the same
 _ALLOWANCES = (1.0, 0.25)  # per fix, in sigmas: a step of two sigmas, a drift that lags by half a sigma
 _OVERSHOOT = 1.166  # of a cumulative sum beyond its limit in discrete time; Siegmund 1985
+_NOISIER = 1.5  # ratio to the configured noise that the sum of the noise finds first
+_LOOKS = 10  # independent values of a standardised constant error in a survey: its information grows by less than 2^10
 
 
 def sum_limit(cfg: EtalonConfig, count: int, allowance: float) -> float:
@@ -58,37 +59,67 @@ class ChannelSums:
         self.sums[..., column] = 0.0
 
 
+class NoiseSum:
+    """Cumulative sum of the log-likelihood ratio of ``_NOISIER`` times the configured noise, for one run or many."""
+
+    def __init__(self, cfg: EtalonConfig, runs: Sequence[int] = ()) -> None:
+        # A sum of log-likelihood ratios passes h less often than once in exp(h) fixes (Lorden 1971).
+        self._limit = -log(0.25 * cfg.false_alarm / SURVEY_FIXES)
+        self.sum: FloatArray = np.zeros(runs)
+
+    def add(self, chi2: FloatArray | float, dof: int) -> FloatArray:
+        """Add a chi-square, (runs,); whether each sum is beyond the limit."""
+        ratio = 0.5 * (1.0 - _NOISIER**-2) * np.asarray(chi2) - dof * log(_NOISIER)
+        self.sum = np.maximum(self.sum + ratio, 0.0)
+        return np.asarray(self.sum > self._limit)
+
+
+def constant_limit(cfg: EtalonConfig, count: int) -> float:
+    """Limit of the standardised constant error of each of ``count`` channels, for 0.15 of the false alarms."""
+    return float(-ndtri(0.15 * cfg.false_alarm / (2 * count * _LOOKS)))
+
+
 class LengthWatch:
     """The running tests of one run; each channel warns once until ``WINDOW`` further fixes have passed."""
 
     def __init__(self, cfg: EtalonConfig, channels: Sequence[int]) -> None:
-        self._cfg, self._columns = cfg, {channel: k for k, channel in enumerate(channels)}
-        self._sums = ChannelSums(cfg, len(channels))
-        self._squares: deque[tuple[float, int]] = deque(maxlen=WINDOW)
+        self._cfg, self._channels = cfg, tuple(channels)
+        self._sums, self._noise = ChannelSums(cfg, len(channels)), NoiseSum(cfg)
+        self._constant_limit = constant_limit(cfg, len(channels))
+        self._is_constant_known = False
+        self._since: list[tuple[float, int]] = []  # chi-squares since the noise last was as configured
         self._quiet: dict[int | None, int] = {}
 
-    def add(self, w: Mapping[int, float], chi2: float, dof: int) -> list[ChannelWarning]:
-        """Add a fix without a located fault."""
+    def add(
+        self, w: Mapping[int, float], chi2: float, dof: int, constant: tuple[FloatArray, FloatArray]
+    ) -> list[ChannelWarning]:
+        """Add a fix without a located fault; ``constant``: of ``NetworkCalibration``, in the order of the channels."""
         self._quiet = {channel: left - 1 for channel, left in self._quiet.items() if left > 1}
-        values = np.zeros(len(self._columns))
-        for channel, value in w.items():
-            values[self._columns[channel]] = value
+        values = np.array([w.get(channel, 0.0) for channel in self._channels])
         beyond = self._sums.add(values)
         found = []
-        for channel, column in self._columns.items():
+        for column, channel in enumerate(self._channels):
             if beyond[column]:
                 self._sums.restart(column)
                 found.append(ChannelWarning(channel, f"the length of channel {channel} has changed against the others"))
-        self._squares.append((chi2, dof))
-        total, freedom = (sum(column) for column in zip(*self._squares, strict=True))
-        if total > noise_limit(self._cfg, int(freedom)):
-            ratio = (total / freedom) ** 0.5
-            found.append(ChannelWarning(None, f"the lengths have {ratio:.1f} times the configured noise"))
-        new = [one for one in found if one.channel not in self._quiet]
+        new = [one for one in (*found, *self._noisy(chi2, dof)) if one.channel not in self._quiet]
         self._quiet |= {one.channel: WINDOW for one in new}
-        return new
+        return [*new, *self._constant(*constant)]
 
+    def _noisy(self, chi2: float, dof: int) -> list[ChannelWarning]:
+        is_noisy = bool(self._noise.add(chi2, dof))
+        self._since = [*self._since, (chi2, dof)] if self._noise.sum > 0.0 else []
+        if not is_noisy:
+            return []
+        total, freedom = (sum(column) for column in zip(*self._since, strict=True))
+        return [ChannelWarning(None, f"the lengths have {(total / freedom) ** 0.5:.1f} times the configured noise")]
 
-def noise_limit(cfg: EtalonConfig, dof: int) -> float:
-    """Limit of the sum of the chi-squares of the last fixes, for a quarter of the false alarms of a survey."""
-    return float(chdtri(dof, cfg.false_alarm / (4.0 * SURVEY_FIXES)))
+    def _constant(self, standardised: FloatArray, errors_m: FloatArray) -> list[ChannelWarning]:
+        """Once a run, because an error since the first fix stays."""
+        worst = int(np.argmax(np.abs(standardised)))
+        if self._is_constant_known or abs(standardised[worst]) <= self._constant_limit:
+            return []
+        self._is_constant_known = True
+        channel, error_um = self._channels[worst], 1e6 * errors_m[worst]
+        text = f"channel {channel} has read {error_um:+.3g} um from the others since the first fix, beyond its prior"
+        return [ChannelWarning(channel, text)]

@@ -1,5 +1,6 @@
 """Faults of single lengths: what is found, located, marked; false alarms of whole surveys; a laser at rest."""
 
+import re
 from collections import Counter
 from math import dist
 from typing import NamedTuple
@@ -59,6 +60,40 @@ def test_a_channel_that_changes_by_five_sigma_warns_within_twenty_points(channel
     found = first_of(alarms(cfg, collimators, pucks, 100, np.random.default_rng(2), fault))
     measured("E11", float(np.max(found)) - begin + 1.0)
     assert np.isfinite(found).all()
+
+
+@pytest.mark.parametrize("channel", range(8))
+def test_an_error_since_the_first_fix_beyond_the_priors_warns_within_twenty_points(channel: int) -> None:
+    """Ten sigma of a length: the random errors of the network hide five in most surveys where a channel is alone."""
+    world = world_of("fyst-m2")
+    cfg, collimators = world.cfg.etalon, np.asarray(world.mirror.collimators_m)
+    pucks = places(world.mirror, HEIGHT_M)[:20]
+    sigma_m = cfg.length_sigma_m + cfg.length_sigma_per_m * np.linalg.norm(pucks[0] - collimators[channel])
+
+    def fault(_: int, lengths: FloatArray) -> FloatArray:
+        changed = lengths.copy()
+        changed[:, channel] += 10.0 * sigma_m
+        return changed
+
+    found = first_of(alarms(cfg, collimators, pucks, 100, np.random.default_rng(5), fault))
+    assert np.isfinite(found).sum() >= 95
+
+
+def test_the_constant_error_of_a_channel_is_named_with_its_size() -> None:
+    world = world_of("fyst-m2")
+    cfg, rng, error_m = world.cfg.etalon, np.random.default_rng(6), 16e-6
+    collimators = dict(zip(world.mirror.channels, np.asarray(world.mirror.collimators_m), strict=True))
+    judge, bad, warnings = FixJudge(cfg, collimators), world.mirror.channels[3], list[str]()
+    for puck in places(world.mirror, HEIGHT_M)[:20]:
+        lengths = {
+            channel: float(np.linalg.norm(there - puck)) + 1e-6 * rng.standard_normal() + error_m * (channel == bad)
+            for channel, there in collimators.items()
+        }
+        warnings += judge.fix(0.0, tuple(puck.tolist()), lengths).warnings
+    (warning,) = warnings
+    found = re.fullmatch(rf"channel {bad} has read \+([\d.]+) um from the others since the first fix.*", warning)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(1e6 * error_m, rel=0.3)  # the network's own error is 2.4 um a channel
 
 
 def test_noise_larger_than_configured_warns_within_twenty_points() -> None:

@@ -9,16 +9,17 @@ from scipy.special import chdtri
 from ccatp.config.models import EtalonConfig
 from ccatp.core import DeckPose, FloatArray
 from ccatp.mirror.length_integrity import NetworkCalibration, chi_square, per_fix, standardised
-from ccatp.mirror.length_watch import WINDOW, ChannelSums, noise_limit
+from ccatp.mirror.length_watch import ChannelSums, NoiseSum, constant_limit
 from ccatp.mirror.mirror import Mirror
 
 
 class Alarms(NamedTuple):
-    """Which runs had an alarm of a single fix, of a channel over the fixes, of the noise; and each first one's fix."""
+    """First fix of an alarm of a single fix, a channel over the fixes, the noise, a constant error; (runs,)."""
 
     single: FloatArray
     channel: FloatArray
     noise: FloatArray
+    constant: FloatArray
 
 
 def places(mirror: Mirror, height_m: float) -> FloatArray:
@@ -41,11 +42,10 @@ def alarms(
 ) -> Alarms:
     """First fix of each kind of alarm in each run (infinite: none). ``fault``: number of the fix and lengths."""
     count = len(collimators_m)
-    network, sums = NetworkCalibration(cfg, count), ChannelSums(cfg, count, (runs,))
+    network, sums, noise = NetworkCalibration(cfg, count), ChannelSums(cfg, count, (runs,)), NoiseSum(cfg, (runs,))
     error = rng.standard_normal((runs, len(network.mean))) * np.sqrt(np.diag(network.covariance))
     network.mean = np.zeros_like(error)
-    first = [np.full(runs, np.inf) for _ in range(3)]
-    squares: list[FloatArray] = []
+    first = [np.full(runs, np.inf) for _ in range(4)]
     rows = tuple(range(count))
     for number, puck in enumerate(pucks_m):
         offsets = puck - collimators_m
@@ -62,9 +62,8 @@ def alarms(
         good = ~is_single[:, None]
         w = standardised(parity, innovation)[0] * good
         network.correct(parity, innovation * good)
-        squares.append(np.where(is_single, dof, chi2))
-        window = squares[-WINDOW:]
-        found = (is_single, sums.add(w).any(axis=1), sum(window) > noise_limit(cfg, dof * len(window)))
+        is_constant = (np.abs(network.constant_errors()[0]) > constant_limit(cfg, count)).any(axis=1)
+        found = (is_single, sums.add(w).any(axis=1), noise.add(np.where(is_single, dof, chi2), dof), is_constant)
         for known, now in zip(first, found, strict=True):
             known[now & np.isinf(known)] = number
     return Alarms(*first)
