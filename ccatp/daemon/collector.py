@@ -34,7 +34,7 @@ from ccatp.links.topics import (
     TruthMessage,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
-from ccatp.mirror.panel_alignment import fit_panels
+from ccatp.mirror.panel_alignment import fit_panels, unreliable_points
 from ccatp.records.recorder import (
     RECORD_FORMAT,
     TELEMETRY,
@@ -263,6 +263,7 @@ class SurveyRecord:
         builder = self._session.builder
         if survey is not None:  # the last status of a main that was terminated may be lost
             builder.set_counts(standings.count("measured"), standings.count("skipped"))
+            builder.set_unreliable(unreliable_points(survey.fixes))
         builder.set_panels({} if survey is None else self._fits(survey), self._injected)
         for path in reversed(recordings(self._run_dir / TELEMETRY)[:-1]):
             earlier = _SurveySession(self._cfg, self.mirror, is_sim=self._is_sim)

@@ -311,6 +311,11 @@ def mirror_wavefront(panels: Iterable[PanelWavefront]) -> MirrorWavefront | None
 _MIN_SPREAD_M = 0.02
 
 
+def unreliable_points(measured: Iterable[Measured]) -> int:
+    """Number of points whose lengths contradict each other."""
+    return len({one.point for one in measured if one.fix.metrology == UNRELIABLE})
+
+
 def fit_panels(mirror: Mirror, measured: Iterable[Measured], puck_height_m: float) -> dict[PanelId, Vector3]:
     """Piston (m), tip and tilt (rad) of every panel with enough reliable points, for the summary of a survey."""
     by_panel: dict[PanelId, list[Measured]] = {}

@@ -120,7 +120,7 @@ class SummaryBuilder:
     def __init__(self, cfg: Config, mirror: Mirror, *, is_sim: bool) -> None:
         self._cfg, self._mirror, self._is_sim = cfg, mirror, is_sim
         self._points, self._lower_bound_s = 0, 0.0
-        self._measured = self._skipped = 0
+        self._measured = self._skipped = self._unreliable = 0
         self._left_out: Mapping[str, Sequence[str]] = {}
         self._mission_time_s = 0.0
         self._ticks_us = RunningStatistics(TICKS)
@@ -217,6 +217,10 @@ class SummaryBuilder:
             self._friction, self._grip = friction, margin
             self._least_grip = np.fmin(self._least_grip, margin)
 
+    def set_unreliable(self, count: int) -> None:
+        """Measured points whose lengths contradict each other."""
+        self._unreliable = count
+
     def set_panels(self, fits: PanelFits, injected: PanelFits | None) -> None:
         """Misalignment of panels as fitted, and as simulated (None on a real robot)."""
         self._fits, self._injected = fits, injected
@@ -258,6 +262,7 @@ class SummaryBuilder:
                 "measured": self._measured,
                 "first_arrival_within_10mm": int(np.count_nonzero(arrivals <= WITHIN_M)),
                 "skipped": self._skipped,
+                **({"unreliable": self._unreliable} if self._unreliable else {}),
                 **({"left_out": {why: list(names) for why, names in self._left_out.items()}} if self._left_out else {}),
             },
             "arrival_error_mm": distribution(arrivals, _IN_MM, scale=1e3, decimals=3),

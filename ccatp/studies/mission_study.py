@@ -6,6 +6,7 @@ quantiles of that distribution divided by N (Bar-Shalom, Li and Kirubarajan 2001
 independent, because a new leg begins after the fix of each stop.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -231,7 +232,7 @@ def combine_missions(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
             name: rounded(rms(np.array([v["panels"][name] for v in values if v["panels"][name] is not None])), 3)
             for name in ("piston_rms_um", "tilt_rms_urad")
         },
-        "counts": {name: sum(v["counts"].get(name, 0) for v in values) for name in values[0]["counts"]},
+        "counts": dict(sum((Counter(v["counts"]) for v in values), Counter[str]())),
     }
     numbers = np.repeat(np.arange(len(runs), dtype=np.float64), [len(rows) for rows in runs])
     arrays = {

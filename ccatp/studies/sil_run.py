@@ -5,7 +5,7 @@ run of the daemon with the same configuration and seed go through the same state
 """
 
 from array import array
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import hypot
@@ -25,9 +25,10 @@ from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.localizer import Localizer
+from ccatp.mirror.fix_judgement import FixJudge
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.multilateration import MultilaterationError, solve_fix
-from ccatp.mirror.panel_alignment import Measured, fit_panels
+from ccatp.mirror.multilateration import MultilaterationError
+from ccatp.mirror.panel_alignment import Measured, fit_panels, unreliable_points
 from ccatp.records.run_reader import TraceBuilder
 from ccatp.records.summary import PanelFits, SummaryBuilder
 from ccatp.sim.fault_plan import FaultPlan, Injected
@@ -122,10 +123,11 @@ class SilLaser:
         channels, collimators_m = mirror.channels, mirror.collimators_m
         rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
         self._etalon = EtalonModel(cfg.sim.etalon, channels, collimators_m, rng)
-        self._collimators_m = dict(zip(channels, collimators_m, strict=True))
+        self._judge = FixJudge(cfg.etalon, dict(zip(channels, collimators_m, strict=True)))
         self._approaches = ApproachCounter(cfg.mission.correction_tolerance_m, cfg.mission.max_approaches)
         self._fixes: list[Measured] = []
         self.stops: list[StopRow] = []
+        self.counts = Counter[str]()  # of fixes, by what the test of their lengths says
 
     def fix(self, t_s: float, estimate: DeckPose) -> Fix:
         """Measure now, for the frame of time ``t_s`` (raises MultilaterationError: no solution, or past a limit)."""
@@ -134,7 +136,15 @@ class SilLaser:
         data = multiline.ChannelData(self._etalon.records(channels, puck))
         lengths_m, _ = multiline.valid_lengths(data, channels)
         expected_m = self._mirror.puck_world(estimate, self._cfg.robot.puck_height_m)
-        return solve_fix(self._cfg.etalon, t_s, expected_m, lengths_m, self._collimators_m)
+        try:
+            fix = self._judge.fix(t_s, expected_m, lengths_m)
+        except MultilaterationError:
+            self.counts["fixes_refused"] += 1
+            raise
+        self.counts[f"fixes_{fix.metrology}"] += 1
+        self.counts["fixes_with_channels_left_out"] += bool(fix.left_out)
+        self.counts["length_warnings"] += len(fix.warnings)
+        return fix
 
     def stop_row(self, t_s: float, point: PointId, truth: Sequence[float], localizer: Localizer) -> StopRow:
         """The state in which a point is measured, before its fix."""
@@ -163,6 +173,10 @@ class SilLaser:
     def panel_fits(self) -> PanelFits:
         """Of the fixes that count; see ``fit_panels``."""
         return fit_panels(self._mirror, self._fixes, self._cfg.robot.puck_height_m)
+
+    def unreliable_points(self) -> int:
+        """Number of points whose fix that counts is unreliable."""
+        return unreliable_points(self._fixes)
 
 
 def rehearse(cfg: Config) -> SilResult:
@@ -345,11 +359,12 @@ class SilRun(SurveyFrames):
         builder.set_mission(len(state.done), len(state.skipped), mission_time_s)
         builder.add_grip(self.thrust.friction, self.thrust.margin)
         builder.set_panels(self.laser.panel_fits(), injected)
+        builder.set_unreliable(self.laser.unreliable_points())
         return SilResult(
             summary=builder.build(),
             stops=self.laser.stops,
             corrections=state.corrections,
-            counts=dict(self.localizer.counts),
+            counts={**self.localizer.counts, **self.laser.counts},
             outcome=str(state.outcome if state.mode is DONE else SurveyOutcome.STOPPED),
             cause=state.cause,
             states_s={str(state): time_s for state, time_s in self.states_s.items()},

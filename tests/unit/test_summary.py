@@ -249,6 +249,12 @@ def test_the_table_has_every_figure_and_counts_points_left_out_by_reason(builder
     assert line.endswith("left_out 2 (operator), 1 (no fix)")
 
 
+def test_points_whose_lengths_contradict_each_other_are_counted_where_there_are_any(builder: SummaryBuilder) -> None:
+    assert "unreliable" not in builder.build()["points"]
+    builder.set_unreliable(2)
+    assert builder.build()["points"]["unreliable"] == 2
+
+
 def test_a_mission_in_two_sessions_has_one_summary() -> None:
     first, second = make(lower_bound_s=50.0), make(lower_bound_s=20.0)
     places = {point: MIRROR.point_on_deck(point) for point in (POINT, OTHER)}
