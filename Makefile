@@ -20,7 +20,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 # One more than there are cores: tests of real processes wait for most of their time.
 PYTEST := $(BIN)/python -m pytest -n $$(($(WORKERS) + 1)) --dist loadgroup --no-loadscope-reorder
 
-.PHONY: help run test tests test-newest newest newest-tests environment test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
+.PHONY: help run test tests test-newest newest environment test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
 .PHONY: kills mutants golden golden-quick lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
@@ -28,7 +28,7 @@ PYTEST := $(BIN)/python -m pytest -n $$(($(WORKERS) + 1)) --dist loadgroup --no-
 help:
 	@echo "make run [ARGS=...]   survey a simulated mirror: ccatp run --sim"
 	@echo "make test             lint, types, import contract, tests"
-	@echo "make test-newest      lint, unit and contract tests and a small survey on the newest Python installed, in $(NEWEST_VENV)"
+	@echo "make test-newest      unit tests and a small survey on the newest Python installed, in $(NEWEST_VENV)"
 	@echo "make test-slow        the tests that take minutes, new random examples, and a tenth of the sweep"
 	@echo "make sweep            drives over every centimetre of every rim; goes on where it was stopped [SHARE=0.1 ARGS='--seed 2']"
 	@echo "make kills            random kills of processes over whole missions; goes on where it was stopped [SIGNALS=2000]"
@@ -69,10 +69,7 @@ test-newest:
 		$(MAKE) --no-print-directory VENV=$(NEWEST_VENV) PYTHON="$$newest" newest; fi
 
 newest: $(VENV)/.installed-dev
-	@$(MAKE) --no-print-directory -j2 lint newest-tests
-
-newest-tests: $(VENV)/.installed-dev
-	$(PYTEST) tests/unit tests/contract $(PYTEST_ARGS)
+	$(PYTEST) tests/unit --ignore=tests/unit/studies $(PYTEST_ARGS)
 	rm -rf build/newest && $(BIN)/ccatp run --sim --panels 2 --run-dir build/newest
 
 # What fails in one part does not keep the others from being run. A tenth of the sweep, chosen at random.

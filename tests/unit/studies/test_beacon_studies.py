@@ -39,6 +39,7 @@ def cells(config: Config) -> dict[str, CellResult]:
     return {case: result(config, case, seeds) for case, seeds in runs.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "key", "low", "high"),
     [
@@ -60,6 +61,7 @@ def test_the_published_figures(cells: dict[str, CellResult], case: str, key: str
     assert low <= value <= high
 
 
+@pytest.mark.slow
 def test_more_updates_change_little_and_the_printed_prior_makes_it_worse(cells: dict[str, CellResult]) -> None:
     cell, prior = cells["zigzag-printed"], cells["zigzag-p0-99"].values
     trace = cell.arrays["trace_m"][1]

@@ -390,9 +390,12 @@ def has(cell: Any, key: str) -> bool:
     return True
 
 
-# A mission with a rigid body takes a quarter of a minute, and that of ``physics`` is one as well.
+# The others share their code, or that of the missions with a rigid body, which take a quarter of a minute.
+SLOW = ("ablation", "bodies", "cricket", "physics", "sensitivity", "slides", "stops")
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "bodies" else []) for name in CAMPAIGNS]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CAMPAIGNS]
 )
 def test_a_study_writes_its_figures_and_all_that_its_table_shows(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
