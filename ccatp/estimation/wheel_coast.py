@@ -11,13 +11,14 @@ What is not known, as the covariance of both angles' errors since the begin of t
   1 - exp(-t/T);
 * the load of a wheel (slope, friction): a real servo follows its set point only to a share of the travel, which is
   learned from d - T w since the last rest; within the gap the rate is wrong by twice this share, and the servo may
-  correct what it owes or not;
+  correct what it owes or not. Both wheels owe in part the same, so the share is learned for their mean and for their
+  difference, each in the direction of its wheel, and apart for legs and turns;
 * T: its learned standard deviation, times the change of the follow error with T;
 * the moment at which a robot held its wheels by a rule of its own, see ``SetPoints``;
 * the set points, where they are not known: anything from the recent rate on to an immediate stop.
 """
 
-from math import exp, sqrt
+from math import copysign, exp, sqrt
 from typing import NamedTuple
 
 from ccatp.control.wheel_motion import SetPoints
@@ -30,9 +31,10 @@ _LAG_SPREAD = 0.2 / sqrt(3.0)
 # A lag is never known better than to this part: servo and load are not exactly of first order.
 _LEAST_LAG_SPREAD = 0.005
 _RATE_SIGMA_RAD_S = 0.05  # of the rate by which the follow error is divided: two counts in 40 ms, smoothed
-# Share of its travel by which a servo under load is off: before any leg, the least, and the travel that shows it.
+# Share of its travel by which a servo under load is off: before any motion, the least, and the travel that shows it.
 _LOAD_SHARE, _LEAST_LOAD_SHARE, _LOADED_RAD = 0.02, 2e-4, 1.0
-_LOAD_MEMORY_S = 3.0  # of motion, over which the share is averaged: some legs
+# Motion over which the share is averaged, some legs; and for how much of it the value before any motion counts.
+_LOAD_MEMORY_S, _LOAD_PRIOR_S = 3.0, 0.1
 _FAST_RAD_S = 0.5  # a slower wheel shows nothing of its lag
 _ALIKE_S = 1.0  # for about so long a servo deviates from first order in the same way
 # After this time without a drive the robot stands: time-to-live of the last drive, and run-down of the wheels.
@@ -53,6 +55,34 @@ WheelInput = SetPoints | CoastedMotion | None
 """Input of a localizer about the wheels besides samples: set points, or in a replay the motion predicted then."""
 
 
+class LoadShares(NamedTuple):
+    """Variance of the share of its travel that a wheel owes: ``mean`` of both wheels, ``half`` of their difference.
+
+    ``seen_s``: motion from which it is known.
+    """
+
+    mean: float = 0.5 * _LOAD_SHARE**2
+    half: float = 0.5 * _LOAD_SHARE**2
+    seen_s: float = _LOAD_PRIOR_S
+
+    @property
+    def one(self) -> float:
+        """Of one wheel."""
+        return self.mean + self.half
+
+    @property
+    def both(self) -> float:
+        """Covariance of both wheels, each in its own direction."""
+        return self.mean - self.half
+
+    def learned(self, dt_s: float, mean2: float, half2: float) -> "LoadShares":
+        """With a new square of each, after ``dt_s`` of motion."""
+        seen_s = min(self.seen_s + dt_s, _LOAD_MEMORY_S)
+        weight, least2 = dt_s / seen_s, 0.5 * _LEAST_LOAD_SHARE**2
+        mean, half = self.mean + weight * (mean2 - self.mean), self.half + weight * (half2 - self.half)
+        return LoadShares(max(mean, least2), max(half, least2), seen_s)
+
+
 class WheelCoast:
     """Follows the set points of both wheels, and predicts the wheels without samples.
 
@@ -67,7 +97,8 @@ class WheelCoast:
         self._least2 = (_LEAST_LAG_SPREAD * wheel_lag_s) ** 2
         self._follows = [0.0, 0.0]  # follow errors of the right and the left wheel, rad
         self._travels = [0.0, 0.0]  # of the set points since the last rest, rad
-        self._share2 = _LOAD_SHARE**2
+        self._shares = {False: LoadShares(), True: LoadShares()}  # of legs, and of turns
+        self._is_turn = False
         self._is_known = self.has_moved = True  # the follow errors are measured
         self.begin(0.0, 0.0, 0.0, is_resting=True)
 
@@ -92,37 +123,52 @@ class WheelCoast:
         if not self._is_known or dt_s <= 0.0:
             return
         of_rate = (self._lag_s * _RATE_SIGMA_RAD_S) ** 2
-        for follow, rate, travel in zip(self._follows, (right_rad_s, left_rad_s), self._travels, strict=True):
+        rates, is_turn = (right_rad_s, left_rad_s), right_rad_s * left_rad_s < 0.0
+        owed = [follow - self._lag_s * rate for follow, rate in zip(self._follows, rates, strict=True)]
+        travel = 0.5 * (self._travels[0] + self._travels[1])
+        if travel > _LOADED_RAD and min(abs(right_rad_s), abs(left_rad_s)) >= _FAST_RAD_S:
+            right, left = copysign(owed[0], owed[0] * right_rad_s), copysign(owed[1], owed[1] * left_rad_s)
+            # The error of the lag is the same for both wheels, that of the rates is not.
+            mean2 = (0.5 * (right + left)) ** 2 - 0.5 * of_rate - self._spread2 * right_rad_s * right_rad_s
+            half2 = (0.5 * (right - left)) ** 2 - 0.5 * of_rate
+            seen2 = travel * travel
+            self._shares[is_turn] = self._shares[is_turn].learned(dt_s, mean2 / seen2, half2 / seen2)
+        for rate, off, travel in zip(rates, owed, self._travels, strict=True):
             if -_FAST_RAD_S < rate < _FAST_RAD_S:
                 continue
-            owed = follow - self._lag_s * rate
-            if travel > _LOADED_RAD:
-                seen2 = (owed * owed - of_rate - self._spread2 * rate * rate) / (travel * travel)
-                self._share2 += dt_s / _LOAD_MEMORY_S * (seen2 - self._share2)
-                self._share2 = max(self._share2, _LEAST_LOAD_SHARE**2)
-            noise = _ALIKE_S / dt_s * ((_DEAD_TIME_S * rate) ** 2 + of_rate + self._share2 * travel * travel)
+            load = self._shares[is_turn].one * travel * travel
+            noise = _ALIKE_S / dt_s * ((_DEAD_TIME_S * rate) ** 2 + of_rate + load)
             gain = self._spread2 * rate / (self._spread2 * rate * rate + noise)
-            self._lag_s = max(self._lag_s + gain * owed, 1e-3)
+            self._lag_s = max(self._lag_s + gain * off, 1e-3)
             self._spread2 = max((1.0 - gain * rate) * self._spread2, self._least2)
 
     def begin(self, right_rad_s: float, left_rad_s: float, reading_rad2: float, *, is_resting: bool) -> None:
         """Begin a gap at these rates of the wheels; ``reading_rad2``: variance of an angle's reading."""
-        self._first2, self._by_lag, self._largest, self._shown2 = [0.0, 0.0], (0.0, 0.0), 0.0, [0.0, 0.0]
+        self._first2, self._shown2 = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]  # right, left, both
+        self._by_lag, self._largest = (0.0, 0.0), 0.0
         self._coasted = [0.0, 0.0]
+        self._is_turn = right_rad_s * left_rad_s < 0.0
         self._kept, self._free = 1.0, (right_rad_s, left_rad_s)
         self.rates = right_rad_s, left_rad_s
         self.has_moved = False
         if is_resting:
             return
-        lag_s, first2, follows = self._lag_s, self._first2, self._follows
+        lag_s, first2, follows, shares = self._lag_s, self._first2, self._follows, self._shares[self._is_turn]
+        kept = [0.0, 0.0]
         for k, rate in enumerate(self._free):
             # Two estimates of the follow error: the measured one, and lag times rate.
-            owed2 = self._share2 * self._travels[k] ** 2
+            owed2 = shares.one * self._travels[k] ** 2
             own = (_DEAD_TIME_S * rate) ** 2 + 2.0 * reading_rad2 + owed2
             of_rate = self._spread2 * rate * rate + (lag_s * _RATE_SIGMA_RAD_S) ** 2
-            share = own / (own + of_rate) if self._is_known else 1.0
-            follows[k] += share * (lag_s * rate - follows[k])
-            first2[k] = (1.0 - share) * own + owed2 if self._is_known else of_rate + owed2
+            kept[k] = of_rate / (own + of_rate) if self._is_known else 0.0
+            follows[k] += (1.0 - kept[k]) * (lag_s * rate - follows[k])
+            first2[k] = kept[k] * own + owed2 if self._is_known else of_rate + owed2
+        owed2 = shares.both * self._travels[0] * self._travels[1]
+        first2[2] = self._sign() * owed2 * (1.0 + sqrt(kept[0] * kept[1]))
+
+    def _sign(self) -> float:
+        """Of the product of both wheels' directions."""
+        return -1.0 if self._is_turn else 1.0
 
     def advance(
         self, dt_s: float, set_points: WheelInput, *, is_right: bool = True, is_left: bool = True
@@ -158,22 +204,25 @@ class WheelCoast:
         self._largest = max(size, self._largest)
         self._kept *= keep
         shown = (1.0 - self._kept) ** 2
-        first_right, first_left = shown * self._first2[0], shown * self._first2[1]
         # A wrong rate is wrong in the whole gap, so that its error grows with the travel and not with its root.
         coasted = self._coasted
         coasted[0] += abs(turns[0])
         coasted[1] += abs(turns[1])
-        first_right += 4.0 * self._share2 * coasted[0] ** 2
-        first_left += 4.0 * self._share2 * coasted[1] ** 2
-        before_right, before_left = self._shown2
-        self._shown2 = [first_right, first_left]
-        stop_right, stop_left = set_points[2:]
+        if turns[0] and turns[1]:
+            self._is_turn = turns[0] * turns[1] < 0.0
+        shares = self._shares[self._is_turn]
+        pairs = (shares.one, 0, 0), (shares.one, 1, 1), (self._sign() * shares.both, 0, 1)
+        before, stops = self._shown2, set_points[2:]
+        self._shown2 = [
+            shown * first2 + 4.0 * share * coasted[i] * coasted[j]
+            for first2, (share, i, j) in zip(self._first2, pairs, strict=True)
+        ]
         return CoastedMotion(
-            turns[0],
-            turns[1],
-            grown * right * right + first_right - before_right + stop_right * stop_right,
-            grown * left * left + first_left - before_left + stop_left * stop_left,
-            grown * right * left + stop_right * stop_left,
+            *turns,
+            *(
+                grown * changes[i] * changes[j] + now - old + stops[i] * stops[j]
+                for now, old, (_, i, j) in zip(self._shown2, before, pairs, strict=True)
+            ),
         )
 
     def _advance_unknown(self, before_s: float) -> CoastedMotion:
