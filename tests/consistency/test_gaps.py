@@ -16,11 +16,12 @@ def wrong(cells: list[Cell]) -> list[str]:
 
 
 @ROW
-def test_a_few_gaps_of_all_encoders(measured: Measured) -> None:
+@pytest.mark.parametrize("motors", MOTORS)
+def test_a_few_gaps_of_all_encoders(motors: str, measured: Measured) -> None:
     """Some seeds of the campaign."""
     ways, silent = (Way("leg", "rule"), Way("turn", "ttl")), ("", "enc", "imu+enc+edge")
-    drives = [run(Drive("hard", "lag"), seed, ways, silent) for seed in range(3)]
-    cells = cells_of(Drive("hard", "lag"), drives)
+    drive = Drive("hard", motors)
+    cells = cells_of(drive, [run(drive, seed, ways, silent) for seed in range(3)])
     assert len(cells) == len(ways) * len(silent) * 6
     assert not wrong(cells)
     measured("S32", max(cell.excess for cell in cells))
