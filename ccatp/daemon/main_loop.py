@@ -325,6 +325,7 @@ class MainLoop(RobotLoop):
         status.exit_status = int(self.exit_status) if is_over else -1
         status.missed_deadlines = lateness.missed_deadlines
         status.worst_lateness_ms = round(1e3 * lateness.worst_s, 3)
+        status.bad_lines, status.bad_line = self.link.counts["bad_lines"], self.link.first_bad_line
         status.alarms = self.alarms.alarms
         return status
 

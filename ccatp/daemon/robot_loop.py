@@ -114,9 +114,9 @@ class RobotLoop(RobotSession):
         self._invalid_s = time.monotonic()
         if self._explained != self.sessions:  # below the limit of bad lines no other line says what is wrong with them
             self._explained = self.sessions
-            self.log.warning("bad_line", session=self.sessions, reason=self.link.bad_line)
+            self.log.warning("bad_line", session=self.sessions, reason=self.link.first_bad_line)
             self.report_bad_line(
-                f"a line of the robot is not valid: {self.link.bad_line}; 'ccatp conformance' checks the firmware"
+                f"a line of the robot is not valid: {self.link.first_bad_line}; 'ccatp conformance' checks the firmware"
             )
 
     def report_bad_line(self, text: str) -> None:

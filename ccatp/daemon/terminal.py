@@ -230,6 +230,7 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
     row = condition_of(status.cause)
     severity = Severity(max(status.severity, row.severity if row is not None else 0))
     late = f"{status.missed_deadlines}, the latest by {status.worst_lateness_ms:.0f} ms"
+    bad = f"{status.bad_lines} from the robot, the first: {status.bad_line}; 'ccatp conformance' checks the firmware"
     rows = [
         ("state", f"{status.state} {status.point}".strip()),
         ("cause", status.cause),
@@ -244,6 +245,7 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("grip", f"friction {status.friction:.2f}, {status.grip:.2f} times the least thrust" if status.grip else ""),
         ("danger", f"{status.code} {CODES.get(status.code, '')}".strip()),
         ("late frames", late if status.missed_deadlines else ""),
+        ("bad lines", bad if status.bad_lines else ""),
         *((f"left out: {why}", _named(points)) for why, points in status.left_out.items()),
         ("over", f"with exit status {status.exit_status}" if status.exit_status >= 0 else ""),
     ]

@@ -114,6 +114,7 @@ class RobotLink(asyncio.Protocol):
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
         newest: the newest frame of the session.
+        first_bad_line: what is wrong with the first bad line of the session, with its field; empty without one.
         session: the robot's number of the session, once it is joined.
     """
 
@@ -146,17 +147,12 @@ class RobotLink(asyncio.Protocol):
         self._budget: BadLineLimit | None = None
         self._last_seq = self.session = -1
         self.newest: Sensors | None = None
-        self._why = self._oddity = ""
+        self._why = self._oddity = self.first_bad_line = ""
 
     @property
     def has_frames(self) -> bool:
         """A valid frame came in this session."""
         return self._last_seq >= 0
-
-    @property
-    def bad_line(self) -> str:
-        """Why the oldest bad line that is kept is none; empty without one."""
-        return self._bad.first_reason
 
     @property
     def _where(self) -> str:
@@ -292,6 +288,7 @@ class RobotLink(asyncio.Protocol):
 
     def _count_bad(self, reason: str) -> None:
         self.counts["bad_lines"] += 1
+        self.first_bad_line = self.first_bad_line or reason.removeprefix("bad line: ")
         if self._bad.add(asyncio.get_running_loop().time(), reason):
             self.abort(f"too many bad lines from the robot, the first: {self._bad.first_reason}")
         elif self._is_joined:

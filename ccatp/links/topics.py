@@ -96,6 +96,8 @@ class MissionStatus(Message):
     exit_status: int = -1  # of the run; -1 until it ends
     missed_deadlines: int = 0  # frames that were served late, in real time
     worst_lateness_ms: float = 0.0
+    bad_lines: int = 0  # lines of the robot that are not valid, in the present session of the main loop
+    bad_line: str = ""  # the field and the reason of the first of them
     left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
     friction: float = 0.0  # of the tyres, by the creep of turns; 0: not measured
     grip: float = 0.0  # full thrust over the least that holds the robot on all of the mirror with it

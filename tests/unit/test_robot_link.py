@@ -125,6 +125,16 @@ async def test_bad_lines_and_unknown_types_are_counted_and_dropped() -> None:
         await seen.until(lambda: seen.frames == [7, 8])
     assert (link.counts["bad_lines"], link.counts["unknown_types"], link.counts["unexpected"]) == (2, 1, 1)
     assert seen.bad_lines == 2
+    assert link.first_bad_line == "JSONDecodeError: Expecting value: line 1 column 1 (char 0)"
+
+
+async def test_the_first_bad_line_of_a_session_is_kept_after_many_others() -> None:
+    first = frame(1).replace(b'"imu":[]', b'"imu":[[0.01,NaN,0.0]]')
+    async with robot(after_join(first, *[b"garbage\n"] * 30)) as (link, seen):
+        await link.connect(DEADLINE_S)
+        await seen.until(lambda: seen.lost != [])
+    assert link.counts["bad_lines"] > 20
+    assert link.first_bad_line == "imu[0][1] is NaN"
 
 
 @pytest.mark.fault("S15")

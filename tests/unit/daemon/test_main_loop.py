@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
+import msgspec
 import pytest
 import zmq
 
@@ -13,6 +14,7 @@ from ccatp.config.load import load_config
 from ccatp.daemon.main_loop import MainLoop
 from ccatp.daemon.mission_runner import MissionRunner
 from ccatp.daemon.process import Endpoints, ProcessArgs
+from ccatp.daemon.terminal import status_rows
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import MissionStatus
 
@@ -33,6 +35,14 @@ def test_a_run_that_ended_publishes_its_status(loop: MainLoop) -> None:
     assert loop.status().exit_status == -1
     loop.finish(ExitStatus.HELD)
     assert loop.status().exit_status == ExitStatus.HELD
+
+
+def test_the_status_shows_the_first_bad_line_while_bad_lines_are_counted(loop: MainLoop) -> None:
+    assert "bad lines" not in dict(status_rows(msgspec.to_builtins(loop.status())))
+    loop.link.counts["bad_lines"], loop.link.first_bad_line = 3, "imu: a number out of range"
+    shown = dict(status_rows(msgspec.to_builtins(loop.status())))["bad lines"]
+    what_to_do = "'ccatp conformance' checks the firmware"
+    assert shown == f"3 from the robot, the first: imu: a number out of range; {what_to_do}"
 
 
 def test_a_process_that_failed_publishes_no_end_of_the_run(loop: MainLoop) -> None:

@@ -192,6 +192,8 @@ function showMission(state) {
   text("point", mission.next_point || "–");
   text("arrival", mission.done ? `${mission.error_mm.toFixed(2)} mm` : "–");
   text("skipped", String(Math.max(mission.skipped, mission.not_to_be_measured)));
+  $("bad-lines-row").hidden = !mission.bad_lines;
+  text("bad-lines", `${mission.bad_lines}, the first: ${mission.bad_line}`);
   text("slips", mission.missed_deadlines ? `${mission.missed_deadlines}, ≤ ${mission.worst_lateness_ms.toFixed(0)} ms` : "0");
 }
 
