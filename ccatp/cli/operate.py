@@ -141,7 +141,9 @@ def alarms(
         return
     found = _ask(common.configured_folder(config_file, runtime_dir), "status", timeout_s)["status"]["alarms"]
     lines = [line for alarm in found for line in _alarm_lines(alarm)]
-    common.print_result({"alarms": found}, lines or ["no alarms"], json_output)
+    common.print_result(
+        {"alarms": found}, lines or ["no alarms; ccatp status shows what the robot waits for"], json_output
+    )
 
 
 def _alarm_lines(alarm: Mapping[str, Any]) -> list[str]:

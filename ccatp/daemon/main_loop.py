@@ -33,7 +33,7 @@ from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
 from ccatp.links.topics import ESTIMATE_FRAMES, DangerEvent, MissionStatus
 from ccatp.safety.escalation import Since
-from ccatp.survey.events import HELD, Abort, Fault, Interrupted, Pause, Resume, StopHere
+from ccatp.survey.events import HELD, WAITS_FOR, Abort, Fault, Interrupted, Pause, Resume, StopHere
 
 # The supervisor ends this process after it has received the last messages; a longer wait is reported.
 SHUTDOWN_REPORT_S = 30.0
@@ -277,7 +277,9 @@ class MainLoop(RobotLoop):
             return f"waiting for a measurement of the laser system; {why}"
         # A mission that has not begun has no cause of its own while it waits for a finding of danger to end.
         found = [alarm.cause for alarm in self.alarms.alarms if not alarm.ended]
-        cause = next(iter((*filter(None, (state.cause,)), *found)), "no alarm is active")
+        cause = next(iter((*filter(None, (state.cause,)), *found)), "")
+        if not cause:
+            return f"{state.mode}, and nothing is wrong: {WAITS_FOR[state.mode]}"
         row, otherwise = condition_of(cause), "'ccatp resume' continues" if state.is_paused else "continues by itself"
         return f"{state.mode}: {cause}; {row.advice if row is not None else otherwise}"
 

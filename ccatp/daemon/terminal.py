@@ -22,6 +22,7 @@ from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
 from ccatp.records.summary import format_table
+from ccatp.survey.events import DONE, HELD, IDLE, MAPPING, MEASURING, SETTLING, WAITS_FOR, MissionState
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
 # Signals that end a run, or the writing of its report.
@@ -197,6 +198,7 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
             signal.signal(number, handler)
 
 
+_STANDING = (IDLE, SETTLING, MEASURING, HELD, DONE, MAPPING)
 CODES = {0: "normal", 1: "near the mirror's edge", 2: "operation aborted"}
 BAR = 30
 _SHOWN = 10
@@ -235,6 +237,7 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("state", f"{status.state} {status.point}".strip()),
         ("cause", status.cause),
         ("severity", severity.name.lower() if severity else ""),
+        ("next", next_text(status)),
         ("since", f"{clock(status.t_s - status.since_s)} ago" if status.cause else ""),
         ("alarms", alarms_text(status.alarms)),
         ("what to do", row.advice if row is not None else ""),
@@ -250,6 +253,12 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("over", f"with exit status {status.exit_status}" if status.exit_status >= 0 else ""),
     ]
     return [(name, value) for name, value in rows if value]
+
+
+def next_text(status: MissionStatus) -> str:
+    """What a robot waits for that stands while nothing is wrong; empty if it moves, or its cause says why it stands."""
+    is_quiet = status.state in _STANDING and not (status.cause or status.alarms) and status.exit_status < 0
+    return WAITS_FOR[MissionState(status.state)] if is_quiet else ""
 
 
 def alarms_text(alarms: Sequence[Alarm]) -> str:

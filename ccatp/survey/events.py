@@ -28,6 +28,20 @@ class MissionState(StrEnum):
 
 IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE, *AMONG_BEACONS = MissionState
 MAPPING, VISITING, FOLLOWING = AMONG_BEACONS
+_MOVES = "stands for a moment before the move or until the danger loop permits it, then goes on by itself"
+# What a robot waits for that stands in a mode while nothing is wrong, and what happens then.
+WAITS_FOR = MappingProxyType(
+    {
+        IDLE: "waits for the robot, its laser system and the permit of the danger loop, then starts by itself",
+        **dict.fromkeys((TURNING, DRIVING, BACKING_OFF, RETURNING, VISITING), _MOVES),
+        SETTLING: "waits until the wheels are at rest, then measures",
+        MEASURING: "waits for the lengths of the laser system, then goes on to the next point",
+        HELD: "goes on by itself when the cause of the hold is gone, else with 'ccatp resume'",
+        DONE: "the run ends by itself",
+        MAPPING: "waits until the motes have measured each other, then drives to the first waypoint",
+        FOLLOWING: "waits until the target moves away, then follows it",
+    }
+)
 
 
 class MissionEvent(StrEnum):

@@ -1,5 +1,6 @@
 """What the main loop publishes as the end of the run."""
 
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -11,12 +12,14 @@ import pytest
 import zmq
 
 from ccatp.config.load import load_config
-from ccatp.daemon.main_loop import MainLoop
+from ccatp.daemon.main_loop import STANDS_REPORT_S, MainLoop
 from ccatp.daemon.mission_runner import MissionRunner
 from ccatp.daemon.process import Endpoints, ProcessArgs
-from ccatp.daemon.terminal import status_rows
+from ccatp.daemon.terminal import next_text, status_rows
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import MissionStatus
+from ccatp.survey.events import WAITS_FOR, MissionState
+from ccatp.survey.state import HoldState
 
 
 @pytest.fixture
@@ -50,3 +53,45 @@ def test_a_process_that_failed_publishes_no_end_of_the_run(loop: MainLoop) -> No
     loop._fail(ConfigError("the configuration is not of this robot"))
     assert loop.over.is_set()
     assert loop.status().exit_status == -1
+
+
+def standing(mode: MissionState, said: list[str]) -> SimpleNamespace:
+    """A runner whose robot stands in a mode, with nothing wrong."""
+    telemetry = SimpleNamespace(
+        flush=lambda _: None, send=lambda *_: None, seq=-1, notify_operator=lambda _, text: said.append(text)
+    )
+    return SimpleNamespace(
+        telemetry=telemetry,
+        mission=SimpleNamespace(state=HoldState(mode=mode)),
+        causes=(),
+        is_at_rest=True,
+        is_busy=False,
+        since_s=0.0,
+        status=lambda: MissionStatus(seq=0, t_s=0.0, state=str(mode)),
+    )
+
+
+@pytest.mark.parametrize("mode", MissionState)
+def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
+    loop: MainLoop, monkeypatch: pytest.MonkeyPatch, mode: MissionState
+) -> None:
+    said: list[str] = []
+    now_s = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    runner = standing(mode, said)
+    loop._runner, loop._telemetry = cast(MissionRunner, runner), runner.telemetry
+    loop.heartbeat.phase = "joined"
+    for _ in range(5):
+        now_s += 0.3 * STANDS_REPORT_S
+        loop.heartbeat.frame_s = now_s
+        loop.publish_levels()
+    assert said == [f"the robot stands for 36 s: {mode}, and nothing is wrong: {WAITS_FOR[mode]}"]
+
+
+def test_the_status_of_a_robot_that_stands_says_what_is_next() -> None:
+    assert next_text(MissionStatus(seq=0, t_s=0.0, state="idle")) == WAITS_FOR[MissionState.IDLE]
+    for told in ({"cause": "operator"}, {"exit_status": 0}):
+        assert next_text(MissionStatus(seq=0, t_s=0.0, state="idle", **told)) == ""
+    for moving in (MissionState.DRIVING, MissionState.FOLLOWING):
+        assert next_text(MissionStatus(seq=0, t_s=0.0, state=str(moving))) == ""
+    assert next_text(MissionStatus(seq=-1, t_s=0.0, state="")) == ""
