@@ -203,8 +203,14 @@ def load_config(file: Path | None = None, overrides: Overrides = None, *, any_po
         what = f"{file}: is of a mission among beacons (system = {format_value(system)})"
         raise NotASurvey(f"{what}, and this is for surveys of mirrors alone; use {use}")
     tree = merged(merged(base.tree, user.tree), command.tree)
+    problems: list[str] = []
     for section in _SECTIONS:
-        tree[section] = _section(section, tree, sources)
+        try:
+            tree[section] = _section(section, tree, sources)
+        except ConfigError as error:
+            problems += error.problems
+    if problems:
+        raise ConfigError(*problems)
     return validated(Config, tree, sources, check_config)
 
 

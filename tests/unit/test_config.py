@@ -508,15 +508,47 @@ def test_the_check_of_a_configuration_reads_the_files_that_it_names(
     if section == "observatory":
         text += f'key_file = "{named}"\nendpoint = "tcp://127.0.0.1:7020"\n'
     file.write_text(text)
-    line = refused(capsys, "config", "check", file)
-    assert f"{section}." in line
-    assert str(named) in line
+    assert main(["config", "check", str(file)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == (2 if section == "observatory" else 1)
+    for line in lines:
+        assert line.startswith(f"ccatp: {section}.")
+        assert str(named) in line
 
 
-def test_a_file_of_another_machine_is_a_warning_of_the_check(
+def test_the_check_of_a_configuration_reports_each_file_that_cannot_be_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where a file is missing, and its neighbours are there and unusable."""
+    keys = "observatory.clients_file", "observatory.key_file", "robot.key_file", "dashboard.token_file"
+    names = {key: tmp_path / key for key in keys}
+    text = 'observatory.endpoint = "tcp://127.0.0.1:7020"\n'
+    file = tmp_path / "telescope.toml"
+    file.write_text(text + "".join(f'{key} = "{path}"\n' for key, path in names.items()))
+    for there in ({}, {"robot.key_file": ""}, {"dashboard.token_file": "short"}, {"observatory.key_file": "no key"}):
+        for key, path in names.items():
+            path.unlink(missing_ok=True)
+            if key in there:
+                path.touch(0o600)
+                path.write_text(there[key])
+        assert main(["config", "check", str(file)]) == 2
+        out, err = capsys.readouterr()
+        assert not out
+        lines = err.splitlines()
+        assert len(lines) == len(names)
+        for line, (key, path) in zip(lines, names.items(), strict=True):
+            assert line.startswith(f"ccatp: {key}: ")
+            assert str(path) in line
+            assert ("No such file or directory" in line) is (key not in there)
+
+
+def test_the_check_of_a_configuration_reports_each_missing_file_of_mirror_and_world(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "telescope.toml"
-    file.write_text(f'[robot]\nkey_file = "{tmp_path / "robot.key"}"\n')
-    assert main(["config", "check", str(file)]) == 0
-    assert "warning: robot.key_file" in capsys.readouterr().err
+    file.write_text('[run]\nmirror = "none.toml"\nworld = "nowhere.toml"\n')
+    assert main(["config", "check", str(file)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert "none.toml" in lines[0]
+    assert "nowhere.toml" in lines[1]
