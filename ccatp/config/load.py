@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
@@ -38,9 +39,11 @@ DEFAULT_FILE, BEACON_FILE, RECORDING_FILE = "ccatp.toml", "radio.toml", "recordi
 ONBOARD_FILE = "onboard.toml"
 SYSTEMS = ("zigbee", "follow", "cricket")
 _RUN_FILE = "config.toml"  # of a run directory
-# Of a run's file. Without its last line the file was cut off: what is missing would be taken from the defaults.
+# Of a run's file. Its last line has the checksum of all before: what is missing would be taken from the defaults.
 _RUN_HEAD = "# The exact configuration of one run, to its last line; ccatp run --config FILE repeats it.\n\n"
-_RUN_END = "\n# End of the configuration.\n"
+_RUN_END = "\n# End of the configuration"
+_CHECKSUM = ", checksum {:08x}.\n"
+_NO_CHECKSUM = ".\n"  # of older versions, whose first ones have neither head nor end
 # Either of them is in the folder of a run before its configuration is.
 _RUN_MARKS = ("origin.json", "mission.sqlite")
 _SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
@@ -132,17 +135,30 @@ def _layers(base: str, file: Path | None, overrides: Overrides, *, any_ports: bo
 
 
 def _check_whole(file: Path, source: ConfigSource) -> None:
-    """Refuse the configuration of a run that is empty or cut off; that of another folder may hold any few keys."""
+    """Refuse the configuration of a run that is not as the run wrote it; another file may hold any few keys."""
     if file.name != _RUN_FILE or not any(file.with_name(name).exists() for name in _RUN_MARKS):
         return
-    if not source.tree:
-        what = "is empty"
-    elif source.text.startswith(_RUN_HEAD) and not source.text.endswith(_RUN_END):
-        what = "is cut off: its last line is missing"
-    else:
-        return
-    advice = "put back a copy, or remove it and name the configuration with --config"
-    raise ConfigError(f"{file}: {what}, so the configuration of the run is not known; {advice}")
+    what = _damage(source.text) if source.tree else "is empty"
+    if what:
+        advice = "put back a copy; if you edited it on purpose, rename it and name it with --config"
+        raise ConfigError(f"{file}: {what}, so the configuration of the run is not known; {advice}")
+
+
+def _damage(text: str) -> str:
+    """How the text of a run's file differs from what the run wrote; empty if it does not, or that is not known."""
+    body, end, rest = text.rpartition(_RUN_END)
+    is_begun = text.startswith(_RUN_HEAD)
+    if not end:
+        return "is cut off: its last line is missing" if is_begun else ""
+    if rest == _NO_CHECKSUM:
+        return "" if is_begun else "is cut off: its first line is missing"
+    if rest != _checksum(body):
+        return "was changed or cut off after the run wrote it"
+    return ""
+
+
+def _checksum(body: str) -> str:
+    return _CHECKSUM.format(zlib.crc32(body.encode()))
 
 
 def _strongest(sources: list[ConfigSource], *keys: Key) -> tuple[ConfigSource, Key]:
@@ -218,7 +234,8 @@ def dump_config(cfg: Config | RadioConfig) -> str:
     """The complete configuration as TOML; the loader of its kind gives an equal one."""
     import tomlkit  # noqa: PLC0415 - only a command that writes a file needs it, and every process reads one
 
-    return _RUN_HEAD + tomlkit.dumps(cfg.model_dump()) + _RUN_END
+    body = _RUN_HEAD + tomlkit.dumps(cfg.model_dump())
+    return body + _RUN_END + _checksum(body)
 
 
 def available(kind: str) -> list[str]:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
+from os import SEEK_END
 from pathlib import Path
 from typing import Literal, NamedTuple, cast
 
@@ -138,8 +139,12 @@ class AlarmList:
             return
         self._lines += 1
         try:
-            with self._path.open("ab") as file:
-                file.write(msgspec.json.encode(event) + b"\n")
+            with self._path.open("ab+") as file:
+                # After a line that a kill cut off, the next event begins on its own line.
+                at = file.seek(0, SEEK_END)
+                file.seek(max(at - 1, 0))
+                is_torn = file.read(1) not in (b"\n", b"")
+                file.write(b"\n" * is_torn + msgspec.json.encode(event) + b"\n")
         except OSError as error:  # the list in memory and the log still have it
             self._log.warning("alarm_not_stored", error=str(error))
 

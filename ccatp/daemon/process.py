@@ -63,11 +63,13 @@ class Endpoints:
 
 
 def run_dir_in(runtime_dir: Path) -> Path | None:
-    """The run directory of the present or the last run in a runtime directory."""
+    """The run directory of the present or the last run in a runtime directory; ``None``: not known."""
     try:
-        return Path(os.fsdecode(read_input(runtime_dir / RUN_DIR_FILE).strip()))
+        name = read_input(runtime_dir / RUN_DIR_FILE)
     except OSError:
         return None
+    # The name is whole with its line end; an empty one would be the present directory.
+    return Path(os.fsdecode(name.strip())) if name.strip() and name.endswith(b"\n") else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,9 +112,13 @@ def read_checkpoint(path: Path, kind: type[Record]) -> Record | None:
     if not slots:
         raise CheckpointError(f"{path}: {'damaged' if data else 'empty'}, {AT_BASE}")
     try:
-        return msgspec.msgpack.decode(max(slots)[1], type=kind)
+        found = msgspec.msgpack.decode(max(slots)[1], type=kind)
     except msgspec.MsgspecError as error:
         raise CheckpointError(f"{path}: of another version of ccatp ({error}), {AT_BASE}") from error
+    # The first record is in the second slot, so that a shorter file was cut off and may have lost the newest record.
+    if len(data) <= _SLOT_BYTES:
+        raise CheckpointError(f"{path}: cut off, {AT_BASE}")
+    return found
 
 
 def _slots(data: bytes) -> list[tuple[int, bytes]]:

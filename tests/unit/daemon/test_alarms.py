@@ -350,3 +350,14 @@ def test_without_an_address_there_is_no_thread() -> None:
     hook.update(status(alarm()))
     hook.close(PATIENCE_S)
     assert not [thread for thread in threading.enumerate() if thread.name == "webhook"]
+
+
+def test_an_event_after_a_line_that_a_kill_cut_off_is_read_again(tmp_path: Path) -> None:
+    update(make(tmp_path), [(FIRE, NONE)], 10.0)
+    path = tmp_path / alarms.FILE
+    whole = path.read_bytes()
+    for kept in range(len(whole) + 1):
+        path.write_bytes(whole[:kept])
+        update(make(tmp_path), [(FIRE, NONE), (FAN, NONE)], 20.0)
+        assert "fan_weak" in {event.name for event in read_history(tmp_path)}
+        assert {name for name, _ in shown(make(tmp_path))} == {"emergency", "fan_weak"}

@@ -1,6 +1,7 @@
 """Run directory, runtime directory, options and start of a run."""
 
 import os
+import re
 import socket
 import subprocess
 from contextlib import ExitStack
@@ -14,6 +15,7 @@ import pytest
 from ccatp.config.load import dump_config, load_config, load_radio_config
 from ccatp.config.models import Config
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
+from ccatp.daemon.process import run_dir_in
 from ccatp.daemon.run_dir import (
     FILE,
     RunOptions,
@@ -424,6 +426,57 @@ def test_no_beginning_of_the_configuration_of_a_run_is_taken_for_all_of_it(
     assert load_config(elsewhere).run.seed == 2
 
 
+LINES = WHOLE.splitlines(keepends=True)
+EDITED = WHOLE.replace("seed = 1\n", "seed = 2\n")
+CHANGES = {
+    "beginning is missing": "".join(LINES[3:]),
+    "middle is missing": "".join([*LINES[:20], *LINES[60:]]),
+    "one line is missing": "".join([*LINES[:20], *LINES[21:]]),
+    "edited": EDITED,
+    "continued": WHOLE + "\n[run]\nseed = 2\n",
+    "comment after it": WHOLE + "# resumed twice\n",
+}
+
+
+@pytest.mark.parametrize("text", CHANGES.values(), ids=[*CHANGES])
+def test_a_configuration_of_a_run_that_is_not_as_the_run_wrote_it_is_refused(tmp_path: Path, text: str) -> None:
+    assert text != WHOLE
+    path = tmp_path / "config.toml"
+    (tmp_path / "mission.sqlite").touch()
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"config\.toml") as refusal:
+        load_config(path)
+    assert "\n" not in str(refusal.value)
+
+
+def test_an_edited_configuration_of_a_run_says_how_it_is_used_and_is_used_so(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    (tmp_path / "origin.json").write_text('{"simulation": true, "run_id": "1"}')
+    path.write_text(EDITED)
+    advice = "put back a copy; if you edited it on purpose, rename it and name it with --config"
+    with pytest.raises(ConfigError, match=advice):
+        load_config(path)
+    assert load_config(path.rename(tmp_path / "edited.toml")).run.seed == 2
+
+
+@pytest.mark.parametrize("newline", ["\r\n", "\r"])
+def test_a_copy_of_the_configuration_with_other_line_ends_is_the_same(tmp_path: Path, newline: str) -> None:
+    path = tmp_path / "config.toml"
+    (tmp_path / "mission.sqlite").touch()
+    path.write_bytes(b"\xef\xbb\xbf" + WHOLE.replace("\n", newline).encode())
+    assert load_config(path) == load_config()
+
+
+def test_configurations_of_runs_of_older_versions_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    (tmp_path / "mission.sqlite").touch()
+    without_checksum = re.sub(r", checksum [0-9a-f]{8}\.\n$", ".\n", WHOLE)
+    for text in (without_checksum, "".join(LINES[2:-2])):  # the first versions wrote neither head nor end
+        assert text != WHOLE
+        path.write_text(text)
+        assert load_config(path) == load_config()
+
+
 @pytest.mark.parametrize("content", [b"", b"{", b"null", b"[]", b"{}", b"\0" * 64, b'{"simulation": 1}', b"\xff"])
 def test_a_damaged_origin_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "origin.json").write_bytes(content)
@@ -445,3 +498,12 @@ def test_a_damaged_name_of_the_last_run_is_no_new_run(
     (tmp_path / "runs" / "unfinished").write_bytes(content)
     with pytest.raises(ConfigError, match="is damaged, so the run that did not finish is not known"):
         find_resumable()
+
+
+@pytest.mark.parametrize("content", [b"", b"\n", b" ", b"/runs/a"])
+def test_a_cut_name_of_the_run_of_a_daemon_is_no_name(tmp_path: Path, content: bytes) -> None:
+    assert run_dir_in(tmp_path) is None
+    (tmp_path / "run_dir").write_bytes(content)
+    assert run_dir_in(tmp_path) is None  # not the present directory
+    (tmp_path / "run_dir").write_bytes(b"/runs/a\n")
+    assert run_dir_in(tmp_path) == Path("/runs/a")

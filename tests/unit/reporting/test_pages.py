@@ -15,6 +15,7 @@ import pytest
 from markupsafe import escape
 
 from ccatp.cli import main
+from ccatp.config.load import dump_config, load_config
 from ccatp.core import Vector3
 from ccatp.errors import ConfigError
 from ccatp.links.topics import FixMessage
@@ -204,7 +205,7 @@ def test_two_surveys_of_one_mirror_agree(
     recorded: Path, run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = run_dir / "config.toml"
-    config.write_text(config.read_text().replace('filter = "ekf"', 'filter = "ukf"'))
+    config.write_text(dump_config(load_config(config, {"run.filter": "ukf"})))
     out, figures = tmp_path / "cmp.html", tmp_path / "figures"
     data = answered(capsys, "compare", recorded, run_dir, "--out", out, "--figures", figures)
     assert (data["one_mirror"], data["agree"], data["dof"], data["report"]) == (True, True, 3, str(out))
