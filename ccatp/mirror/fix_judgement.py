@@ -15,6 +15,7 @@ from ccatp.mirror.length_integrity import Judgement, LengthIntegrity
 from ccatp.mirror.length_watch import LengthWatch
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 
+_MOST_M = 1e6  # no laser measures so far, and squares of such lengths are exact enough
 _NEEDED = 4  # lengths of a position
 
 
@@ -25,7 +26,7 @@ def outside(
     limit_m = cfg.max_distance_m + cfg.max_residual_m
     found = {}
     for channel, length_m in lengths_m.items():
-        there_m = float(np.linalg.norm(collimators_m[channel] - np.array(expected_m)))
+        there_m = dist(collimators_m[channel].tolist(), expected_m)
         if not abs(length_m - there_m) <= limit_m:
             found[channel] = f"{length_m:.4g} m instead of {there_m:.4g} m"
     return found
@@ -46,8 +47,11 @@ class FixJudge:
         impossible = outside(cfg, expected_m, lengths_m, self._collimators_m)
         possible = {channel: length for channel, length in lengths_m.items() if channel not in impossible}
         if len(possible) < _NEEDED:
-            # The error of the solution of all, or that too few lengths are possible.
-            solve_fix(cfg, t_s, expected_m, lengths_m, self._collimators_m)
+            # The error of the solution of all if they can be solved, or that too few lengths are possible.
+            if all(0.0 < length < _MOST_M for length in lengths_m.values()) and all(
+                abs(one) < _MOST_M for one in expected_m
+            ):
+                solve_fix(cfg, t_s, expected_m, lengths_m, self._collimators_m)
             raise MultilaterationError(f"impossible lengths: {_listed(impossible)}")
         found = self._integrity.judge(expected_m, possible)
         self._check(found, expected_m)

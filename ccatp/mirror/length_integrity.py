@@ -17,6 +17,7 @@ in the later innovations (Willsky and Jones 1976).
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from math import inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -28,11 +29,14 @@ from ccatp.mirror.multilateration import MultilaterationError, RangeSolution, mu
 
 GOOD, UNCHECKED, UNRELIABLE = "good", "unchecked", "unreliable"
 SURVEY_FIXES = 800  # number of fixes of a survey for which the probability of a false alarm is configured
-_DETECTED_FROM, _LOCATED_FROM, _TWO_FROM = 5, 6, 8  # valid channels
+LOCATED_FROM = 6  # valid channels
+_DETECTED_FROM, _TWO_FROM = 5, 8
 _POWER = 0.999  # of the minimal detectable error
 _CLEAR = 13.8  # least difference of the chi-squares of the best and the second explanation, 0.001 for two explanations
 _COVER = 3.3  # sigmas of the noise in a protection level, 0.999
 _PER_COLLIMATOR = 3
+# Part of an error, or of the largest information of a channel, below which only rounding shows it in the parity vector.
+_INVISIBLE = 1e-12
 
 
 def per_fix(cfg: EtalonConfig) -> float:
@@ -114,7 +118,8 @@ class NetworkCalibration:
 
         Both (count,), or (runs, count).
         """
-        information = np.maximum(self._information, 1e-30)
+        is_shown = self._information > _INVISIBLE * np.max(self._information)
+        information = np.where(is_shown, self._information, np.inf)
         return np.asarray(self._scores / np.sqrt(information)), np.asarray(self._scores / information)
 
 
@@ -126,12 +131,14 @@ def chi_square(parity: Parity, innovation: FloatArray) -> FloatArray:
 def standardised(parity: Parity, innovation: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Errors of single channels that the innovation shows, each standard normal without a fault; and their sigmas, m.
 
-    Shapes (m,) or (runs, m), and (m,). Reference: Baarda 1968 (w-test).
+    Shapes (m,) or (runs, m), and (m,). An error that shows in no innovation is 0 with an infinite sigma. Reference:
+    Baarda 1968 (w-test).
     """
     weights = np.linalg.solve(parity.covariance, parity.basis.T)
     information = np.einsum("ij,ji->i", parity.basis, weights)
-    sigmas = 1.0 / np.sqrt(np.maximum(information, 1e-30))
-    return np.asarray(innovation @ weights * sigmas), sigmas
+    is_shown = information > _INVISIBLE * np.max(information)
+    inverse = 1.0 / np.sqrt(np.where(is_shown, information, 1.0))
+    return np.asarray(innovation @ weights * np.where(is_shown, inverse, 0.0)), np.where(is_shown, inverse, np.inf)
 
 
 class Judgement(NamedTuple):
@@ -141,7 +148,7 @@ class Judgement(NamedTuple):
     length found with probability 0.999, in the worst channel (infinite without redundancy). ``protection_m``: error of
     the position by an undetected fault of one channel, or of all (offset, scale) alike, with the noise.
     ``inconsistency_m``: error of the position that the contradiction allows. ``w``: standardised errors
-    by channel, of a good fix.
+    by channel, of a fix without a contradiction whose lengths are new.
     """
 
     solution: RangeSolution
@@ -155,6 +162,11 @@ class Judgement(NamedTuple):
     protection_m: float
     inconsistency_m: float
     w: Mapping[int, float]
+
+
+def _is_shown(pattern: FloatArray, error: FloatArray) -> bool:
+    """Whether errors of the lengths (m,) show in the parity vector by more than rounding."""
+    return float(pattern @ pattern) > _INVISIBLE * float(error @ error)
 
 
 class _Subset(NamedTuple):
@@ -179,15 +191,17 @@ class LengthIntegrity:
         """Solve, test, and exclude; raises ``MultilaterationError`` without a solution."""
         channels = tuple(lengths_m)
         whole = self._solve(channels, expected_m, lengths_m)
+        is_new = lengths_m != self._before
         if self._is_consistent(whole):
             self._learn(whole, lengths_m)
-            return self._judgement(whole, UNCHECKED if len(channels) < _DETECTED_FROM else GOOD, (), ())
+            metrology = UNCHECKED if len(channels) < _DETECTED_FROM else GOOD
+            return self._judgement(whole, metrology, (), (), is_new=is_new)
         best, suspects = self._locate(whole, expected_m, lengths_m)
         if best is None:
-            return self._judgement(whole, UNRELIABLE, (), suspects)
+            return self._judgement(whole, UNRELIABLE, (), suspects, is_new=is_new)
         left_out = tuple(channel for channel in channels if channel not in best.channels)
         self._learn(best, lengths_m)
-        return self._judgement(best, GOOD, left_out, left_out)
+        return self._judgement(best, GOOD, left_out, left_out, is_new=is_new)
 
     def _solve(self, channels: tuple[int, ...], expected_m: Vector3, lengths_m: Mapping[int, float]) -> _Subset:
         ranges_m = np.array([lengths_m[channel] for channel in channels])
@@ -212,7 +226,7 @@ class LengthIntegrity:
     ) -> tuple[_Subset | None, tuple[int, ...]]:
         """The channels without the faulty ones if one explanation is clearly the best; and the suspects."""
         count = len(whole.channels)
-        for number, needed in ((1, _LOCATED_FROM), (2, _TWO_FROM)):
+        for number, needed in ((1, LOCATED_FROM), (2, _TWO_FROM)):
             if count < needed:
                 break
             found = []
@@ -239,6 +253,8 @@ class LengthIntegrity:
         parity, best = whole.parity, whole.chi2
         for error in self._common(whole):
             pattern = error @ parity.basis
+            if not _is_shown(pattern, error):
+                continue
             weighted = np.linalg.solve(parity.covariance, pattern)
             gain = float(weighted @ whole.innovation) ** 2 / float(pattern @ weighted)
             best = min(best, whole.chi2 - gain)
@@ -260,19 +276,16 @@ class LengthIntegrity:
             self.network.correct(some.parity, some.innovation)
 
     def _judgement(
-        self, some: _Subset, metrology: str, left_out: tuple[int, ...], suspects: tuple[int, ...]
+        self, some: _Subset, metrology: str, left_out: tuple[int, ...], suspects: tuple[int, ...], *, is_new: bool
     ) -> Judgement:
         w, sigmas = standardised(some.parity, some.innovation)
         dof = len(some.innovation)
         # A chi-square above its limit needs at most this error of a single channel, in sigmas of that error.
         least = float(np.sqrt(self._limit(dof)) + ndtri(_POWER))
         moves = self._moves(some)
-        slopes = np.linalg.norm(moves, axis=0)
-        patterns = self._common(some) @ some.parity.basis
-        visible = np.sum(patterns * np.linalg.solve(some.parity.covariance, patterns.T).T, axis=1)
-        common_m = np.linalg.norm(moves @ self._common(some).T, axis=0) / np.sqrt(np.maximum(visible, 1e-30))
+        # Per sigma of its visibility: what an error of one channel, or of all alike, moves the position.
+        moved_m = [*(np.linalg.norm(moves, axis=0) * sigmas).tolist(), *self._moved_by_common(some, moves)]
         noise_m = _COVER * float(np.sqrt(np.linalg.eigvalsh(some.solution.covariance_m2)[-1]))
-        worst_m = float(np.max(slopes * sigmas))
         is_checked = len(some.channels) >= _DETECTED_FROM
         return Judgement(
             solution=some.solution,
@@ -282,13 +295,24 @@ class LengthIntegrity:
             suspects=suspects,
             chi2=some.chi2,
             dof=dof,
-            detectable_m=least * float(np.max(sigmas)) if is_checked else float("inf"),
-            protection_m=least * max(worst_m, float(np.max(common_m))) + noise_m if is_checked else float("inf"),
-            inconsistency_m=max(worst_m, float(np.max(common_m))) * float(np.sqrt(some.chi2))
+            detectable_m=least * float(np.max(sigmas)) if is_checked else inf,
+            protection_m=least * max(moved_m) + noise_m if is_checked else inf,
+            # An error that does not show in the parity vector cannot explain the contradiction.
+            inconsistency_m=max(filter(isfinite, moved_m), default=0.0) * float(np.sqrt(some.chi2))
             if metrology == UNRELIABLE
             else 0.0,
-            w={} if metrology == UNRELIABLE else dict(zip(some.channels, w.tolist(), strict=True)),
+            w=dict(zip(some.channels, w.tolist(), strict=True)) if is_new and metrology != UNRELIABLE else {},
         )
+
+    def _moved_by_common(self, some: _Subset, moves: FloatArray) -> list[float]:
+        """Move of the position by each error common to all lengths, per sigma; infinite if it does not show."""
+        parity, found = some.parity, []
+        for error in self._common(some):
+            pattern = error @ parity.basis
+            visible = float(pattern @ np.linalg.solve(parity.covariance, pattern))
+            moved_m = float(np.linalg.norm(moves @ error))
+            found.append(moved_m / visible**0.5 if _is_shown(pattern, error) else inf)
+        return found
 
     def _moves(self, some: _Subset) -> FloatArray:
         """Change of the position per error of each length, (3, m)."""

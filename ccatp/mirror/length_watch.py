@@ -6,7 +6,7 @@ and for a slow drift, and one for noise larger than configured. A deviation that
 calibrated and does not show in them; beyond the priors it is found by ``NetworkCalibration.constant_errors``.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import log
 from typing import NamedTuple
 
@@ -15,12 +15,15 @@ from scipy.special import ndtri
 
 from ccatp.config.models import EtalonConfig
 from ccatp.core import FloatArray
-from ccatp.mirror.length_integrity import SURVEY_FIXES
+from ccatp.mirror.length_integrity import LOCATED_FROM, SURVEY_FIXES
 
 WINDOW = 20  # fixes without a second warning of the same
 _ALLOWANCES = (1.0, 0.25)  # per fix, in sigmas: a step of two sigmas, a drift that lags by half a sigma
 _OVERSHOOT = 1.166  # of a cumulative sum beyond its limit in discrete time; Siegmund 1985
 _NOISIER = 1.5  # ratio to the configured noise that the sum of the noise finds first
+# Least difference of twice the log-likelihoods for naming one channel, a hundred times as likely as any other. With few
+# valid channels their standardised errors are nearly equal, whichever of them is wrong.
+_CLEAR = 9.2
 _LOOKS = 10  # independent values of a standardised constant error in a survey: its information grows by less than 2^10
 
 
@@ -34,9 +37,9 @@ def sum_limit(cfg: EtalonConfig, count: int, allowance: float) -> float:
 
 
 class ChannelWarning(NamedTuple):
-    """What changed: the channel (``None``: the noise of all) and a text for operators."""
+    """What changed: the channels of which one is wrong (empty: the noise of all), and a text for operators."""
 
-    channel: int | None
+    channels: tuple[int, ...]
     text: str
 
 
@@ -54,9 +57,13 @@ class ChannelSums:
         self.sums = np.maximum(self.sums + signed - self._allowances, 0.0)
         return np.asarray((self.sums > self._limits).any(axis=(-3, -2)))
 
-    def restart(self, column: int) -> None:
-        """Begin again for one channel."""
-        self.sums[..., column] = 0.0
+    def likelihoods(self) -> FloatArray:
+        """Twice the log-likelihood ratio of a change of each channel (..., channels), by a shift of two allowances."""
+        return np.asarray((4.0 * self._allowances * self.sums).max(axis=(-3, -2)))
+
+    def restart(self) -> None:
+        """Begin again."""
+        self.sums = np.zeros_like(self.sums)
 
 
 class NoiseSum:
@@ -96,15 +103,26 @@ class LengthWatch:
         """Add a fix without a located fault; ``constant``: of ``NetworkCalibration``, in the order of the channels."""
         self._quiet = {channel: left - 1 for channel, left in self._quiet.items() if left > 1}
         values = np.array([w.get(channel, 0.0) for channel in self._channels])
-        beyond = self._sums.add(values)
         found = []
-        for column, channel in enumerate(self._channels):
-            if beyond[column]:
-                self._sums.restart(column)
-                found.append(ChannelWarning(channel, f"the length of channel {channel} has changed against the others"))
-        new = [one for one in (*found, *self._noisy(chi2, dof)) if one.channel not in self._quiet]
-        self._quiet |= {one.channel: WINDOW for one in new}
-        return [*new, *self._constant(*constant)]
+        if self._sums.add(values).any():
+            channels = self._likely(self._sums.likelihoods(), w)
+            # All begin again: an error of one channel raises the sums of the others, too.
+            self._sums.restart()
+            self._is_constant_known = True  # an error that began later would be taken for one since the first fix
+            found.append(ChannelWarning(channels, f"the length of {_named(channels)} has changed against the others"))
+        new = [one for one in (*found, *self._noisy(chi2, dof)) if not self._quiet.keys() >= {*_keys(one)}]
+        self._quiet |= {key: WINDOW for one in new for key in _keys(one)}
+        return [*new, *self._constant(*constant, w)]
+
+    def _likely(self, likelihoods: FloatArray, valid: Collection[int]) -> tuple[int, ...]:
+        """The channels that cannot be distinguished from the most likely one.
+
+        All valid ones if they are too few to locate a fault: a change that is not as assumed then seems to be of a
+        certain channel.
+        """
+        least, unlocated = float(np.max(likelihoods)) - _CLEAR, valid if len(valid) < LOCATED_FROM else ()
+        of_channel = zip(self._channels, likelihoods.tolist(), strict=True)
+        return tuple(channel for channel, one in of_channel if (0.0 < one >= least) or channel in unlocated)
 
     def _noisy(self, chi2: float, dof: int) -> list[ChannelWarning]:
         is_noisy = bool(self._noise.add(chi2, dof))
@@ -112,14 +130,25 @@ class LengthWatch:
         if not is_noisy:
             return []
         total, freedom = (sum(column) for column in zip(*self._since, strict=True))
-        return [ChannelWarning(None, f"the lengths have {(total / freedom) ** 0.5:.1f} times the configured noise")]
+        return [ChannelWarning((), f"the lengths have {(total / freedom) ** 0.5:.1f} times the configured noise")]
 
-    def _constant(self, standardised: FloatArray, errors_m: FloatArray) -> list[ChannelWarning]:
+    def _constant(self, standardised: FloatArray, errors_m: FloatArray, valid: Collection[int]) -> list[ChannelWarning]:
         """Once a run, because an error since the first fix stays."""
         worst = int(np.argmax(np.abs(standardised)))
         if self._is_constant_known or abs(standardised[worst]) <= self._constant_limit:
             return []
         self._is_constant_known = True
-        channel, error_um = self._channels[worst], 1e6 * errors_m[worst]
-        text = f"channel {channel} has read {error_um:+.3g} um from the others since the first fix, beyond its prior"
-        return [ChannelWarning(channel, text)]
+        channels, error_um = self._likely(standardised**2, valid), 1e6 * errors_m[worst]
+        by = f"{error_um:+.3g} um" if len(channels) == 1 else f"{error_um:+.3g} um (if it is {self._channels[worst]})"
+        text = f"{_named(channels)} has read {by} from the others since the first fix, beyond its prior"
+        return [ChannelWarning(channels, text)]
+
+
+def _keys(warning: ChannelWarning) -> tuple[int | None, ...]:
+    return warning.channels or (None,)
+
+
+def _named(channels: Sequence[int]) -> str:
+    if len(channels) == 1:
+        return f"channel {channels[0]}"
+    return f"one of the channels {', '.join(map(str, channels))}"
