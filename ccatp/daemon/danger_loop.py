@@ -90,7 +90,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
             self.raised = int(kept.get("raised", len(self._active) + len(self._cleared)))
         except FileNotFoundError:
             return
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             # The content is not known, so the survey is aborted, to be safe.
             unknown = str(uuid.uuid4())
             advice = f"taken for an emergency; 'ccatp clear {unknown}' ends it"

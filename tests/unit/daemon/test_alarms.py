@@ -361,3 +361,16 @@ def test_an_event_after_a_line_that_a_kill_cut_off_is_read_again(tmp_path: Path)
         update(make(tmp_path), [(FIRE, NONE), (FAN, NONE)], 20.0)
         assert "fan_weak" in {event.name for event in read_history(tmp_path)}
         assert {name for name, _ in shown(make(tmp_path))} == {"emergency", "fan_weak"}
+
+
+def test_emergencies_whose_file_was_cut_off_or_damaged_are_taken_for_one(tmp_path: Path, log: Log) -> None:
+    path = tmp_path / FILE
+    latch = PersistentEmergencyLatch(path, log)
+    latch.raise_emergency("fire", str(uuid.UUID(int=1)))
+    latch.raise_emergency("power", str(uuid.UUID(int=2)), "the second")
+    whole = path.read_bytes()
+    cuts = [whole[:kept] for kept in range(len(whole) + 1)]
+    damaged = [b"[]", b"null", b"{}", b"\0" * 64, b"[" * 100_000, b'{"active":[],"cleared":[],"raised":Infinity}']
+    for content in (*cuts, *damaged):
+        path.write_bytes(content)
+        assert PersistentEmergencyLatch(path, log).is_latched
