@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import cast
 
 from ccatp.config.robot_limits import hello_problems
-from ccatp.errors import DaemonUnreachableError
+from ccatp.errors import DaemonUnreachableError, one_line
 from ccatp.links.robot_codec import (
     BadLine,
     BadLineCounter,
@@ -42,6 +42,7 @@ BACKLOG_S = 30.0
 FLOOD_FACTOR = 3.0
 # A dead peer is detected within seconds: by unacknowledged data for 1000 ms, or by silence for 1 s and 3 probes of 1 s.
 LINUX_OPTIONS = {"TCP_USER_TIMEOUT": 1000, "TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
+LONGEST_REASON = 160  # characters of what is wrong with a bad line; it may contain names that the robot sent
 
 
 class RobotLinkError(DaemonUnreachableError):
@@ -288,7 +289,7 @@ class RobotLink(asyncio.Protocol):
 
     def _count_bad(self, reason: str) -> None:
         self.counts["bad_lines"] += 1
-        self.first_bad_line = self.first_bad_line or reason.removeprefix("bad line: ")
+        self.first_bad_line = self.first_bad_line or one_line(reason.removeprefix("bad line: "), LONGEST_REASON)
         if self._bad.add(asyncio.get_running_loop().time(), reason):
             self.abort(f"too many bad lines from the robot, the first: {self._bad.first_reason}")
         elif self._is_joined:

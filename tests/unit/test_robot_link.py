@@ -13,7 +13,15 @@ from msgspec.structs import replace
 from ccatp.config.files import read_key
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.robot_codec import RobotFrame, encode, join_mac
-from ccatp.links.robot_link import LineWriter, RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol
+from ccatp.links.robot_link import (
+    LONGEST_REASON,
+    LineWriter,
+    RobotLink,
+    RobotLinkError,
+    RobotRefused,
+    RobotTimeout,
+    WrongProtocol,
+)
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from tests.support.daemon import HELLO as OF_ROBOT
 from tests.support.daemon import Waiting, link_to
@@ -135,6 +143,17 @@ async def test_the_first_bad_line_of_a_session_is_kept_after_many_others() -> No
         await seen.until(lambda: seen.lost != [])
     assert link.counts["bad_lines"] > 20
     assert link.first_bad_line == "imu[0][1] is NaN"
+
+
+@pytest.mark.parametrize("name", [b"k" * 4000, b"\\u0007\\n\\u202e", "Ł".encode() * 500])
+async def test_the_reason_of_a_bad_line_is_one_printable_line_of_bounded_length(name: bytes) -> None:
+    bad = b'{"type":"sensors","' + name + b'":NaN}\n'
+    async with robot(after_join(bad + frame(7))) as (link, seen):
+        await link.connect(DEADLINE_S)
+        await seen.until(lambda: seen.frames == [7])
+    assert link.first_bad_line
+    assert link.first_bad_line.isprintable()
+    assert len(link.first_bad_line) <= LONGEST_REASON
 
 
 @pytest.mark.fault("S15")
