@@ -74,24 +74,29 @@ class Program:
         """Forwards and backwards by turns, so that it stays where it is."""
         return next(self._rates_rad_s)
 
-    def after(self, word: str, since_s: float) -> float:
-        """When the wheels were ``word`` for the first time after a time."""
+    def free_after(self, since_s: float) -> float:
+        """When the wheels were let go for the first time after a time."""
         deadline_s = time.monotonic() + PATIENCE_S
         with self.is_said:
             while True:
-                found = next((t_s for name, t_s in self.events if name == word and t_s >= since_s), None)
+                found = next((t_s for name, t_s in self.events if name == "free" and t_s >= since_s), None)
                 if found is not None:
                     return found
                 if not self.is_said.wait(deadline_s - time.monotonic()):
-                    raise TimeoutError(f"not {word} within {PATIENCE_S:g} s")
+                    raise TimeoutError(f"not free within {PATIENCE_S:g} s")
 
     def held_after(self, since_s: float) -> float:
-        """When what happened at a time held the wheels. ``Disturbed``: they were held already."""
+        """When what happened at a time held the wheels. ``Disturbed``: they were held already, also if told late."""
+        deadline_s = time.monotonic() + PATIENCE_S
         with self.is_said:
-            before = [name for name, t_s in self.events if t_s < since_s]
-        if before[-1:] != ["free"]:
-            raise Disturbed
-        return self.after("held", since_s)
+            while True:
+                if [name for name, t_s in self.events if t_s < since_s][-1:] != ["free"]:
+                    raise Disturbed
+                found = next((t_s for name, t_s in self.events if name == "held" and t_s >= since_s), None)
+                if found is not None:
+                    return found
+                if not self.is_said.wait(deadline_s - time.monotonic()):
+                    raise TimeoutError(f"not held within {PATIENCE_S:g} s")
 
     def stopped(self) -> None:
         """Wait until every thread of the process is stopped, and what it sent before has been read."""
@@ -152,7 +157,7 @@ def driving(program: Program) -> Iterator[Driver]:
     start_s = time.monotonic()
     driver = Driver(program.port, program.next_rate_rad_s())
     try:
-        program.after("free", start_s)
+        program.free_after(start_s)
         time.sleep(0.2)
         yield driver
     finally:
@@ -186,9 +191,11 @@ def _signalled(number: int) -> Callable[[Program, Driver], float]:
     def trial(program: Program, driver: Driver) -> float:
         now_s = time.monotonic()
         program.process.send_signal(number)
-        held_s = program.held_after(now_s)
-        program.process.send_signal(number)
-        program.after("free", held_s)
+        try:
+            held_s = program.held_after(now_s)
+        finally:
+            program.process.send_signal(number)
+        program.free_after(held_s)
         return held_s - now_s
 
     return trial
