@@ -72,7 +72,8 @@ def _more_pages(app, docname, source):
     if docname != "index":
         return
     named = set(re.findall(r"^([\w/]+)$", source[0], re.MULTILINE))
-    here = {path.stem for path in Path(app.srcdir).glob("*.md")} - {"index"}
+    paths = (path.relative_to(app.srcdir) for path in Path(app.srcdir).rglob("*.md"))
+    here = {path.with_suffix("").as_posix() for path in paths} - {"index"}
     if more := sorted(here - named):
         source[0] += "\n```{toctree}\n:caption: More\n:maxdepth: 1\n\n" + "\n".join(more) + "\n```\n"
 

@@ -106,7 +106,7 @@ def _analysed(analysis: Callable[[Any, Path], dict[str, Any]], cfg: Any, out: Pa
         raise CampaignFailed(f"{what}; make room or choose another --out") from error
 
 
-PAGE = "docs/bench.md"
+PAGE = "docs/measurements/bench.md"
 
 
 @common.command("ccatp bench --quick", "ccatp bench --json", "ccatp bench --markdown")

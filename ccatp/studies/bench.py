@@ -144,7 +144,7 @@ def write_page(path: Path, result: Mapping[str, Any]) -> None:
 
 
 def tables(result: Mapping[str, Any], *, is_page: bool = False) -> str:
-    """Machine, Markdown tables of the cases, and each note once: for the terminal and for ``docs/bench.md``."""
+    """Machine, Markdown tables of the cases, and each note once: for the terminal and for ``bench --markdown``."""
     cases = result["cases"]
     frames, steps = ([case for case in cases if ("us_spread" in case) is is_frame] for is_frame in (True, False))
     notes = dict.fromkeys(case["note"] for case in cases if "note" in case)

@@ -243,6 +243,6 @@ def test_range_and_bearing_over_fifty_long_runs() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="1 run in 35 is too sure of a wrong place: docs/slam.md, Measured")
+@pytest.mark.xfail(strict=True, reason="1 run in 35 is too sure of a wrong place: docs/measurements/slam.md, Measured")
 def test_ranges_alone_over_fifty_long_runs() -> None:
     check_consistent(50, int(2 * pi / TURN_RAD) * 3, bearings=False)

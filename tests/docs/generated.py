@@ -201,7 +201,7 @@ MADE: dict[str, Callable[[], str]] = {
 def pages() -> dict[Path, str]:
     """The pages with markers, as they should be."""
     found = {}
-    for path in sorted(DOCS.glob("*.md")):
+    for path in sorted(DOCS.rglob("*.md")):
         text = path.read_text(encoding="utf-8")
         made = MARKED.sub(lambda match: f"{match[1]}{MADE[match[2]]().rstrip()}\n{match[3]}", text)
         if MARKED.search(text):

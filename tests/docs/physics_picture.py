@@ -1,4 +1,4 @@
-"""``MUJOCO_GL=egl python -m tests.docs.physics_picture``: docs/physics.png, the robot on M2 with the forces on it.
+"""``MUJOCO_GL=egl python -m tests.docs.physics_picture`` draws docs/measurements/physics.png: robot and forces on M2.
 
 Up in the picture is against gravity. White: weight; orange: thrust; green: what each contact gives. 10 N are 40 mm. The
 lines on the mirror are 100 mm apart.
@@ -76,7 +76,7 @@ def main() -> None:
         up = -gravity + (gravity @ forward) * forward
         for camera in scene.camera:
             camera.pos, camera.forward, camera.up = eye, forward, up / np.linalg.norm(up)
-        imsave(Path("docs") / "physics.png", renderer.render())
+        imsave(Path("docs") / "measurements" / "physics.png", renderer.render())
 
 
 if __name__ == "__main__":

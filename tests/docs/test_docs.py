@@ -21,7 +21,7 @@ from tests.docs.generated import DOCS, MADE, MARKED, ROOT, pages, shown
 from tests.unit.reporting.recorded import record
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
-SOURCES = [*sorted(DOCS.glob("*.md")), ROOT / "README.md"]
+SOURCES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md"]
 # Console commands that are quick and need no daemon: these are not only understood but run.
 EXAMPLES = {"ID": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"}  # for placeholders that a command would refuse
 RUN = frozenset(("config", "plan", "report", "align", "compare"))

@@ -174,7 +174,7 @@ def _drawn_errors(
     the estimate differ from those at the true positions, so they are drawn again at ``maps`` drawn maps (iterated
     bootstrap: Hall 1986; 0: at the estimate alone). These maps are turned to both sides, so the covariance across the
     arcs is too large (NEES 0.8), and phase 2 is more cautious than with errors at the estimate alone
-    (docs/cricket.md). ``places_m``: the estimate, shape (n, d). Zeros without draws.
+    (docs/measurements/cricket.md). ``places_m``: the estimate, shape (n, d). Zeros without draws.
     """
     count, d = places_m.shape
     if draws == 0:

@@ -65,7 +65,7 @@ class BeaconInnovation(msgspec.Struct, frozen=True, gc=False):
 
 
 class BeaconSlam:
-    """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``; docs/slam.md has the models.
+    """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``; docs/measurements/slam.md has the models.
 
     Args:
         motion: motion model of the vehicle.
