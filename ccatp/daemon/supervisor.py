@@ -286,7 +286,7 @@ class SupervisedRun:
 
 
 def run(options: RunOptions) -> int:
-    """Run the configured survey or mission among beacons to its end; returns the exit status (docs, ``cli.md``).
+    """Run the configured survey or mission among beacons to its end; returns the exit status (``docs/operator.md``).
 
     CcatpError: the run could not begin.
     """
