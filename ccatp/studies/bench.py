@@ -21,6 +21,7 @@ from ccatp.studies.bench_frame import BenchError, frame_cases
 EQUAL_WITHIN = 1e-10  # every entry of mean and covariance, SI units
 ROUNDS, QUICK_ROUNDS = 40, 4
 MOST_DENSE_ROUNDS = 10
+FRAMES_OF_RESULT = ("mission in process", "lockstep")
 PACKAGES = ("ccatp", "numpy", "scipy", "filterpy", "stonesoup")
 CPU_INFO = Path("/proc/cpuinfo")
 
@@ -149,7 +150,32 @@ def tables(result: Mapping[str, Any], *, is_page: bool = False) -> str:
     frames, steps = ([case for case in cases if ("us_spread" in case) is is_frame] for is_frame in (True, False))
     notes = dict.fromkeys(case["note"] for case in cases if "note" in case)
     machine_text = machine_line(result["machine"])
-    return render("bench.md", machine=machine_text, frames=frames, steps=steps, notes=notes, is_page=is_page)
+    result_text = result_lines(frames, steps) if is_page else ""
+    return render(
+        "bench.md", machine=machine_text, result=result_text, frames=frames, steps=steps, notes=notes, is_page=is_page
+    )
+
+
+def result_lines(frames: Sequence[Mapping[str, Any]], steps: Sequence[Mapping[str, Any]]) -> str:
+    """The result with which the page begins: a frame in process and in lockstep, and the ratios of each peer."""
+    lines = []
+    for kind in FRAMES_OF_RESULT:
+        case = next((case for case in frames if case["name"].startswith(kind)), None)
+        if case is not None:
+            ratio = f"{case['ratio']:.2f} times the time of {case['peer']}"
+            lines.append(f"A frame takes {case['us_p50']:.0f} µs ({case['name']}), {ratio}.")
+    ratios: dict[str, list[float]] = {}
+    for case in steps:
+        if case["ratio"] is not None:
+            ratios.setdefault(case["peer"], []).append(case["ratio"])
+    if ratios:
+        spans = (f"{peer} {_span(values)}" for peer, values in ratios.items())
+        lines.append(f"Time of a step divided by that of the peer: {', '.join(spans)}.")
+    return "\n".join(lines)
+
+
+def _span(values: Sequence[float]) -> str:
+    return " to ".join(dict.fromkeys(f"{value:.2f}" for value in (min(values), max(values))))
 
 
 def machine_line(machine: Mapping[str, Any]) -> str:

@@ -22,6 +22,7 @@ from tests.unit.reporting.recorded import record
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 SOURCES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md"]
+LONGEST_RESULT = 5  # lines, of a page of measurements
 # Console commands that are quick and need no daemon: these are not only understood but run.
 EXAMPLES = {"ID": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"}  # for placeholders that a command would refuse
 RUN = frozenset(("config", "plan", "report", "align", "compare"))
@@ -51,6 +52,14 @@ def test_what_is_made_from_the_code_is_current() -> None:
     assert {name for _, name, _ in used} == set(MADE)
     for path, text in found.items():
         assert path.read_text(encoding="utf-8") == text, f"{path.name} is not current: make docs"
+
+
+@pytest.mark.parametrize("path", sorted((DOCS / "measurements").glob("*.md")), ids=lambda path: path.stem)
+def test_a_page_of_measurements_begins_with_its_result(path: Path) -> None:
+    title, result, *_ = path.read_text(encoding="utf-8").split("\n\n")
+    assert re.fullmatch(r"# [^\n]+", title)
+    assert result.startswith("**Result.** ")
+    assert result.count("\n") < LONGEST_RESULT
 
 
 @pytest.mark.parametrize("path", [path for path in SOURCES if blocks(path, "python")], ids=lambda path: path.stem)

@@ -57,6 +57,20 @@ def test_a_missing_peer_leaves_ours_and_says_how_to_install_it(monkeypatch: pyte
     assert "\n".join(lines).count("not installed") == 2
 
 
+def test_the_page_begins_with_a_frame_of_each_kind_and_the_ratios_of_each_peer() -> None:
+    frames = [
+        {"name": name, "us_p50": us, "peer": "plain processes", "ratio": us / 200.0}
+        for name, us in (("mission in process, a", 100.0), ("lockstep, idle", 400.0), ("lockstep, busy", 500.0))
+    ]
+    steps = [{"peer": peer, "ratio": ratio} for peer, ratio in (("x", 0.5), ("y", 0.25), (None, None), ("x", 0.125))]
+    assert bench.result_lines(frames, steps).splitlines() == [
+        "A frame takes 100 µs (mission in process, a), 0.50 times the time of plain processes.",
+        "A frame takes 400 µs (lockstep, idle), 2.00 times the time of plain processes.",
+        "Time of a step divided by that of the peer: x 0.12 to 0.50, y 0.25.",
+    ]
+    assert bench.result_lines([], [{"peer": None, "ratio": None}]) == ""
+
+
 def test_the_command_and_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "QUICK_ROUNDS", 1)
     page = tmp_path / "bench.md"
@@ -79,6 +93,9 @@ def test_the_command_and_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert len(table) == len(result["cases"]) + 2
     assert len({line.count("|") for line in table}) == 1
     assert page.read_text().endswith(bench.tables(result))
+    assert page.read_text().startswith(
+        "# Benchmarks\n\n**Result.** Time of a step divided by that of the peer: eq. 2.13 "
+    )
     written = page.read_text()
     page.write_text(f"old\n{bench.BY_HAND}kept\n")
     bench.write_page(page, result)
