@@ -388,5 +388,5 @@ def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Pat
         from ccatp.daemon.process import run_dir_in
 
         runs = [f"{folder} ({run_dir.name if (run_dir := run_dir_in(folder)) else 'starts'})" for folder in running]
-        raise ConfigError(f"{len(running)} runs go on; choose one with --runtime-dir: {', '.join(runs)}")
+        raise ConfigError(f"{len(running)} runs are in progress; choose one with --runtime-dir: {', '.join(runs)}")
     return running[0] if running else None

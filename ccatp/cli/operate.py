@@ -62,7 +62,7 @@ def _operator_command(name: str, help_text: str) -> click.Command:
 
 
 pause = _operator_command("pause", "Stop the robot where it is, until resume.")
-resume = _operator_command("resume", "Carry on after pause.")
+resume = _operator_command("resume", "Continue after a pause.")
 abort = _operator_command("abort", "Give up the survey and drive the robot to its base.")
 stop = _operator_command("stop", "Hold the wheels where the robot is, save, and end the daemon.")
 

@@ -59,7 +59,7 @@ COLOURS = {"pass": "green", "warn": "yellow", "fail": "bright_red", "skip": "bri
 
 
 @common.command("ccatp check --config telescope.toml", "ccatp check --sim", "ccatp check --sim --json")
-@click.option("--sim", is_flag=True, help="Start the stand-ins of robot and laser system, and check those.")
+@click.option("--sim", is_flag=True, help="Start the simulators of robot and laser system, and check those.")
 @common.WORLD_OPTIONS
 @click.option("--runs-dir", type=common.PATH, default="runs", show_default=True, help="Of the recordings.")
 @common.json_option("As JSON on standard output, nothing else there.")
@@ -68,7 +68,7 @@ def check(
     sim: bool, config_file: Path | None, settings: Mapping[str, object], runs_dir: Path, json_output: bool,
     runtime_dir: Path | None,
 ) -> int:  # fmt: skip
-    """Look at everything a mission needs before it begins: robot, laser system, sensors, clock, disk, keys.
+    """Check everything that a mission needs: robot, laser system, sensors, clock, disk, keys.
 
     The robot stands at base. Nothing moves. The status is 1 where something fails, with what to do beside it.
     """

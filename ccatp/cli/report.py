@@ -34,8 +34,8 @@ _JSON = common.json_option("The figures of it as JSON on standard output.")
 def report(run_dir: Path, out: Path | None, figures: Path | None, tables: Path | None, json_output: bool) -> int:
     """Write the report of a run: one page that opens without a network.
 
-    How the panels lie, how good the measurement was, where the time went, events. It takes runs that are over, go on,
-    were killed or resumed, and says what is missing.
+    Panel alignment, quality of the measurement, use of the time, events. It takes runs that are
+    finished, running, killed or resumed, and says what is missing.
     """
     from ccatp.report.run_page import report_run
 
@@ -52,7 +52,7 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, tables: Path |
 @_FIGURES
 @_JSON
 def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
-    """Put two runs beside each other: figures, configuration, time, errors, and which panels have moved."""
+    """Compare two runs: figures, configuration, time, errors, and which panels have moved."""
     from ccatp.report.compare import COMPARISON, compare_data, compare_lines, compare_runs
 
     path = out or run_b / COMPARISON
@@ -109,7 +109,7 @@ def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: s
 def align(
     run_dir: Path, settings: Mapping[str, object], csv_file: Path | None, figure_file: Path | None, json_output: bool
 ) -> int:
-    """Show how the panels lie and how to turn their adjusters, from the fixes of a run."""
+    """Show the alignment of the panels and the turns of their adjusters, from the fixes of a run."""
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.mirror_alignment import compare, survey_result
     from ccatp.records.run_reader import read_run

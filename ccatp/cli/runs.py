@@ -78,8 +78,8 @@ def _facts(run_dir: Path) -> dict[str, Any]:
     ended: dict[str, Any] = next((event for event in reversed(events) if event.get("event") == "run_finished"), {})
     summary = _read_json(run_dir / "summary.json")
     points, origin = summary.get("points", {}), _read_json(run_dir / "origin.json")
-    state = "going on" if is_held(run_dir / RUN_LOCK) else "not finished"
-    if ended and state != "going on":
+    state = "running" if is_held(run_dir / RUN_LOCK) else "not finished"
+    if ended and state != "running":
         state = ExitStatus(ended["status"]).name.lower()
     try:
         system = parse_toml((run_dir / "config.toml").read_text(encoding="utf-8"), "").get("system", "")

@@ -30,7 +30,7 @@ def _endpoint(_ctx: click.Context, _param: click.Parameter, endpoint: str | None
 
 @click.group(cls=common.CommandGroup, epilog=common.example("ccatp sim robot --port 7010"))
 def sim() -> None:
-    """Stand-ins of robot and laser system, alone."""
+    """Run only the simulators of robot and laser system."""
 
 
 @sim.command(

@@ -31,7 +31,7 @@ class _StudyCommand(click.Command):
 @click.argument("name", metavar="NAME")
 @click.option(
     "--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
-    help="Where to write, studies/NAME if not given; a campaign that was stopped goes on there.",
+    help="Where to write, studies/NAME if not given; a campaign that was stopped continues there.",
 )  # fmt: skip
 @click.option(
     "--runs", type=click.IntRange(min=1), metavar="N", help="Seeds of each cell; else the study's own number."
@@ -123,7 +123,7 @@ def bench(
     config_file: Path | None, settings: Mapping[str, object], quick: bool, steps_only: bool, frames_only: bool,
     markdown: Path | None, json_output: bool,
 ) -> int:  # fmt: skip
-    """Time this project's parts against peers that compute the same, by turns in one run."""
+    """Time this project's parts against peers that compute the same, alternately, in one run."""
     import tempfile
 
     from ccatp.config.load import dump_config, load_config

@@ -94,7 +94,7 @@ def _check(drive: RecordedDrive, robot: RobotConfig) -> None:
     if len(drive.segments) < MIN_SEGMENTS:
         raise CalibrationError(
             f"the drive has {len(drive.segments)} legs with a fix at each end, {MIN_SEGMENTS} are needed"
-            + (f" ({drive.left_out} are left out)" if drive.left_out else "")
+            + (f" ({drive.left_out} are not used)" if drive.left_out else "")
             + "; drive again"
         )
     turns = [

@@ -362,5 +362,5 @@ def read_drive(run_dir: Path) -> ReadDrive:
     if drive.left_out:
         legs = "1 leg is" if drive.left_out == 1 else f"{drive.left_out} legs are"
         why = "a restart of the robot, a step of its clock or missing frames"
-        warnings.append(f"{recording.path}: {legs} left out of the calibration because of {why}")
+        warnings.append(f"{recording.path}: {legs} not used for the calibration because of {why}")
     return ReadDrive(drive, mirror, cfg, tuple(warnings))

@@ -119,7 +119,7 @@ def check_fix(cfg: Config, mirror: Mirror, fix: Fix) -> PreflightResult:
     if fix.metrology == UNRELIABLE:
         return warned(f"{found}; the lengths contradict each other: channels {_listed(fix.suspects)}", todo)
     if fix.left_out:
-        return warned(f"{found}; left out: channels {_listed(fix.left_out)}", "check the beam of that channel")
+        return warned(f"{found}; not used: channels {_listed(fix.left_out)}", "check the beam of that channel")
     if fix.metrology == UNCHECKED:
         return warned(f"{found}; too few lengths to contradict each other", "clear the beams of the other channels")
     return passed(found)

@@ -23,7 +23,7 @@ UNITS = {
     "_1_s2": "1/s2", "_1_m": "1/m", "_hz": "Hz", "_mm": "mm", "_m": "m", "_s": "s", "_duty": "share, 0 to 1",
 }  # fmt: skip
 _HEAD = """\
-# Configuration of ccatp. A key that is left out has the value shown here. Uncomment those that differ at your
+# Configuration of ccatp. A key that is not in the file has the value shown here. Uncomment those that differ at your
 # telescope; UNVERIFIED marks what has to be measured or confirmed there. ccatp config check FILE looks for mistakes.
 """
 

@@ -60,8 +60,8 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
 
 def _why_held(points: Sequence[PointId], measured: Collection[PointId], skipped: Collection[PointId]) -> str:
     left = [point for point in points if point not in measured and point not in skipped]
-    goes_on = f"goes on with point {left[0].row}-{left[0].col}-{left[0].point}" if left else "ends it"
-    counts = f"{len(measured)} points are measured and will be left out, {len(left)} are to do"
+    goes_on = f"continues with point {left[0].row}-{left[0].col}-{left[0].point}" if left else "ends it"
+    counts = f"{len(measured)} points are measured and will be skipped, {len(left)} are to do"
     return f"restarted: {counts}; 'ccatp resume' {goes_on}"
 
 

@@ -82,11 +82,11 @@ class RestartPolicy:
                 restarts_s.popleft()
             if len(restarts_s) < self._limit:
                 restarts_s.append(now_s)
-                meanwhile = "wheels held meanwhile" if spec.is_needed else "the survey goes on"
+                meanwhile = "wheels held meanwhile" if spec.is_needed else "the survey continues"
                 return ProcessEnd.RESTART, f"{what}: restarting it, {meanwhile}"
             what += f", more than {self._limit} times within {self._window_s:g} s"
         if not spec.is_needed:
-            return ProcessEnd.WITHOUT, f"{what}: the survey goes on without it"
+            return ProcessEnd.WITHOUT, f"{what}: the survey continues without it"
         return (ProcessEnd.END, what) if is_final else (ProcessEnd.HELD, f"{what}: run ended, wheels held")
 
 

@@ -182,7 +182,7 @@ class Collector:
 
     def _on_recorder_failure(self, reason: str) -> None:
         if self._view is not None:
-            self._view.show_message("error", f"{reason}; the survey goes on")
+            self._view.show_message("error", f"{reason}; the survey continues")
 
     def _request(self, request: bytes) -> dict[str, Any]:
         """Reply of the simulated truth; empty if it has ended, when all its messages have arrived."""

@@ -187,7 +187,7 @@ class FixService:
         if stuck and self._follow is not None and self._follow.is_certain:
             raise LaserStuck(LASER_NOT_FOLLOWING.text(count=self._follow.standstills))
         if doubt:
-            self._notify("info", f"the fix at {_name(request.point)} is doubted: {doubt}")
+            self._notify("info", f"the fix at {_name(request.point)} is not used: {doubt}")
             return doubt
         for notice in localizer.notices:
             self._notify("warning", notice)

@@ -283,7 +283,7 @@ def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
     run_dir = options.run_dir or _make_new(default_run_dir(name, cfg.run.seed, datetime.now(UTC)))
     has_mission = (run_dir / "mission.sqlite").exists()
     if has_mission and not options.resume:
-        advice = "give --resume to go on with it, or another folder" if is_survey else "name another folder"
+        advice = "give --resume to continue it, or another folder" if is_survey else "name another folder"
         raise ConfigError(f"--run-dir: {run_dir} holds a mission already; {advice}")
     if options.resume and not has_mission:
         raise ConfigError(f"--resume: no mission in {run_dir}; name the folder of the run with --run-dir")

@@ -296,7 +296,7 @@ def run(options: RunOptions) -> int:
     if options.resume or options.recover:
         flag = "--resume" if options.resume else "--resume-last"
         raise ConfigError(
-            f"{flag}: a mission among beacons has nothing to go on with, its map is not kept; start a new one"
+            f"{flag}: a mission among beacons cannot be resumed, because its map is not kept; start a new one"
         )
     if options.faults_file is not None:
         raise ConfigError("--faults: plans are for surveys; sim.incidents of the configuration holds those of beacons")

@@ -93,10 +93,10 @@ def state_text(state: MissionState, cause: str) -> str:
     if cause:
         return f"{state}: {cause}"
     is_end = state in (MissionState.HELD, MissionState.BACKING_OFF, MissionState.DONE)
-    return f"{state}" if is_end else f"going on: {state}"
+    return f"{state}" if is_end else f"resumed: {state}"
 
 
-GIVEN_UP = "the calibration drive is left out, as the robot was held elsewhere: slip and heading are learned on the way"
+GIVEN_UP = "no calibration drive, because the robot was held elsewhere: slip and heading are learned on the way"
 DENIAL_REPEAT_S = 1.0
 
 

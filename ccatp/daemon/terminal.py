@@ -135,7 +135,7 @@ class RunView:
         state, elapsed = status.state, f"{clock(status.elapsed_s)} elapsed"
         if self._is_survey:
             arrival = f", arrival {status.error_mm:.2f} mm" if status.error_mm else ""
-            rest = f"{clock(status.eta_s)} to go{arrival}"
+            rest = f"{clock(status.eta_s)} remaining{arrival}"
         else:
             state += f" ({status.cause})" if status.cause else ""
             rest = f"position known to {0.1 * status.error_mm:.1f} cm"
@@ -226,31 +226,32 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
     status = _read(answered)
     filled = round(BAR * share_done(status))
     skips = f", {status.skipped} skipped" if status.skipped else ""
-    bound = f"no path takes less than {clock(status.lower_bound_s)}"
+    bound = f"minimum {clock(status.lower_bound_s)}"
     # The error is exactly zero before the first arrival.
     arrival = f"{status.error_mm:.2f} mm from the last point, as estimated" if status.error_mm else "none yet"
     row = condition_of(status.cause)
     severity = Severity(max(status.severity, row.severity if row is not None else 0))
-    late = f"{status.missed_deadlines}, the latest by {status.worst_lateness_ms:.0f} ms"
+    late = f"{status.missed_deadlines}, worst {status.worst_lateness_ms:.0f} ms"
+    grip = f"friction {status.friction:.2f}, thrust {status.grip:.2f} times the least that holds the robot"
     bad = f"{status.bad_lines} from the robot, the first: {status.bad_line}; 'ccatp conformance' checks the firmware"
     rows = [
         ("state", f"{status.state} {status.point}".strip()),
         ("cause", status.cause),
         ("severity", severity.name.lower() if severity else ""),
         ("next", next_text(status)),
-        ("since", f"{clock(status.t_s - status.since_s)} ago" if status.cause else ""),
+        ("for", clock(status.t_s - status.since_s) if status.cause else ""),
         ("alarms", alarms_text(status.alarms)),
         ("what to do", row.advice if row is not None else ""),
         ("outcome", status.outcome),
         ("points", f"{status.done} of {status.total} measured{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"),
-        ("time", f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} to go, {bound}"),
+        ("time", f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} remaining, {bound}"),
         ("arrival", arrival),
-        ("grip", f"friction {status.friction:.2f}, {status.grip:.2f} times the least thrust" if status.grip else ""),
+        ("grip", grip if status.grip else ""),
         ("danger", f"{status.code} {CODES.get(status.code, '')}".strip()),
         ("late frames", late if status.missed_deadlines else ""),
         ("bad lines", bad if status.bad_lines else ""),
-        *((f"left out: {why}", _named(points)) for why, points in status.left_out.items()),
-        ("over", f"with exit status {status.exit_status}" if status.exit_status >= 0 else ""),
+        *((f"not measured: {why}", _named(points)) for why, points in status.left_out.items()),
+        ("exit status", str(status.exit_status) if status.exit_status >= 0 else ""),
     ]
     return [(name, value) for name, value in rows if value]
 
@@ -277,5 +278,5 @@ def status_line(answered: Mapping[str, Any]) -> str:
     status = _read(answered)
     what = f"{status.state} {status.point}".strip()
     cause = f" ({status.cause})" if status.cause else ""
-    times = f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} to go"
+    times = f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} remaining"
     return f"{100.0 * share_done(status):.0f} %: {status.done} of {status.total} points, {what}{cause}, {times}"

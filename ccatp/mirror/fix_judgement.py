@@ -60,7 +60,7 @@ class FixJudge:
             for channel in found.left_out
         }
         warnings = [
-            f"channel {channel} contradicts the others and is left out: {why}"
+            f"channel {channel} contradicts the others and is not used: {why}"
             for channel, why in left_out.items()
             if channel not in self._left_out
         ]

@@ -134,7 +134,7 @@ def _remarks(result: PanelResult, rare: float) -> list[str]:
     lines = []
     if result.outliers:
         names = ", ".join(f"{row}/{col}/{number}" for row, col, number in result.outliers)
-        lines.append(f"{where}: left out as outliers: {names}; measure them again")
+        lines.append(f"{where}: not used, because they are outliers: {names}; measure them again")
     if result.probability < rare:
         lines.append(
             f"{where}: its points contradict each other by more than they are uncertain (chance "

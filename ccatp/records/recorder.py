@@ -383,7 +383,7 @@ def _damage(path: Path, condition: Condition) -> str:
         return f"{path}: damaged or cut off at byte {condition.size_bytes}"
     where = f"{path}: damaged or cut off at byte {condition.lost[0][0]}"
     more = f" and in {len(condition.lost) - 1} more places" if len(condition.lost) > 1 else ""
-    return f"{where}{more}, {condition.lost_bytes} of {condition.size_bytes} bytes are lost and left out"
+    return f"{where}{more}, {condition.lost_bytes} of {condition.size_bytes} bytes are lost"
 
 
 def read_metadata(path: Path) -> dict[str, str]:

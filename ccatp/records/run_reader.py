@@ -236,7 +236,7 @@ class Recording:
                 lost.append(str(error))
         if lost:
             what = f"{len(lost)} messages" if len(lost) > 1 else "a message"
-            self.warnings.append(f"{self.path}: what cannot be read is left out: {what}, {lost[0]}")
+            self.warnings.append(f"{self.path}: what cannot be read is not used: {what}, {lost[0]}")
 
     def _take(self, timeline: Timeline, place: int, message: object) -> list[Placed]:
         if isinstance(message, topics.SensorLines):

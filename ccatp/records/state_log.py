@@ -62,7 +62,7 @@ def read_log(path: Path, warnings: list[str]) -> Iterator[ReadLine]:
     except OSError as error:
         warnings.append(f"{path.name}: cannot be read: {error.strerror or error}")
     if bad:
-        warnings.append(f"{path.name}: {bad} lines cannot be read and are left out")
+        warnings.append(f"{path.name}: {bad} lines cannot be read and are not used")
 
 
 def _parsed(text: str) -> ReadLine | None:

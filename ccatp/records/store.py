@@ -351,7 +351,7 @@ def _read(uri: str, path: Path, mirror: str) -> StoredSurvey:
         _check_file(db, path, mirror)
         damaged = _damaged_points(db)
         warnings = [
-            f"point {point_name(point)}: its stored fix is damaged and left out; measure it again" for point in damaged
+            f"point {point_name(point)}: its stored fix is damaged and not used; measure it again" for point in damaged
         ]
         fixes = tuple(one for one in _fixes(db) if one.point not in damaged)
         return StoredSurvey(tuple(_points(db)), fixes, tuple(warnings))

@@ -426,13 +426,13 @@ class Timeline:
             where = f"before frame {step.number} ({step.t_s:.2f} s of mission time)"
             if step.kind == "restart":
                 how = ", inferred from its frame numbers" if is_inferred else ""
-                yield f"the robot restarted {where}{how}; times go on there without the time that it was off"
+                yield f"the robot restarted {where}{how}; times continue there without the time that it was off"
             else:
-                yield f"the robot's clock stepped by {step.by_s:+.3f} s {where}; times go on without the step"
+                yield f"the robot's clock stepped by {step.by_s:+.3f} s {where}; times continue without the step"
         if len(self.steps) > _NAMED:
-            yield f"{len(self.steps) - _NAMED} more restarts and steps of the robot's clock; times go on likewise"
+            yield f"{len(self.steps) - _NAMED} more restarts and steps of the robot's clock; times continue likewise"
         if self.unknown_from is not None:
-            yield f"the frames from number {self.unknown_from} on cannot be joined to a truth, which is left out there"
+            yield f"the frames from number {self.unknown_from} on cannot be joined to a truth, which is not used there"
 
 
 def first_of_each(numbers: IntArray | FloatArray) -> IntArray:

@@ -432,5 +432,5 @@ def outcome_of(record: RunRecord) -> PointOutcome:
     if status is None:
         return PointOutcome("no mission", "main published no status of the mission", is_good=False)
     if record.summary is None:
-        return PointOutcome("no end is recorded", "the run goes on, or was killed", is_good=False)
+        return PointOutcome("no end is recorded", "the run is in progress, or was killed", is_good=False)
     return PointOutcome("interrupted", status.cause or f"while {status.state}", is_good=False)

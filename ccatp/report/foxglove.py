@@ -198,7 +198,7 @@ RobotView = _message(
 )  # fmt: skip
 SensorView = _message(
     "Sensors",
-    "Scalars to plot, of every tenth frame: the newest sample of each sensor; what is not known is left out.",
+    "Scalars to plot, of every tenth frame: the newest sample of each sensor; unknown values are omitted.",
     t_s=float, seq=int, fan_left=float, fan_right=float, battery=float, held=bool,
     **dict.fromkeys((*WHEELS, *INERTIAL), _NUMBER), **dict.fromkeys(EDGES, _INT),
     drive_age_s=_NUMBER, permit_age_s=_NUMBER,

@@ -249,7 +249,7 @@ def surface_figure(
     if len(kept):
         axes.scatter(kept[:, 0], kept[:, 1], s=size, c=kept[:, 2], zorder=5, label="measured point", **look)
     if len(outliers):
-        look = {"linewidths": 1.4, "zorder": 6, "label": "outlier, left out"}
+        look = {"linewidths": 1.4, "zorder": 6, "label": "outlier, not used"}
         axes.scatter(outliers[:, 0], outliers[:, 1], marker="x", color=BAD, s=1.5 * size, **look)
     small: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 5.5, "color": INK, "zorder": 6}
     for panel in panels if with_moves else ():

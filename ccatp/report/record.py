@@ -216,7 +216,7 @@ class RunFolder:
                 return found
             self.warnings.append(f"{path.name}: is no summary")
         except FileNotFoundError:
-            self.missing.append(f"{path.name}: the run goes on, or was killed before its end")
+            self.missing.append(f"{path.name}: the run is in progress, or was killed before its end")
         except (OSError, ValueError) as error:
             self.warnings.append(f"{path.name}: cannot be read: {error}")
         return None
@@ -255,7 +255,7 @@ class RunFolder:
         if timeline.missing:
             self.warnings.append(f"{path.name}: {timeline.missing} frames are missing in between")
         if lost:
-            self.warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are left out: {lost[0]}")
+            self.warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are not used: {lost[0]}")
         if (mark := metadata.get("simulation")) is not None:
             self.is_simulation = mark == "true"
         return Recording(path.name, found, metadata.get("ccatp", "unknown"), timeline)
@@ -277,7 +277,7 @@ def _session(found: Recording, mirror: Mirror, changes: Sequence[StateChange], w
     try:
         deck = deck_rows(mirror, track[:, 2:4].astype(np.int64).tolist(), track[:, 4:7])
     except MirrorError as error:
-        warnings.append(f"{found.name}: its estimates are not of this mirror and are left out: {error}")
+        warnings.append(f"{found.name}: its estimates are not of this mirror and are not used: {error}")
         track, deck = track[:0], np.empty((0, 4))
     return RecordedSession(
         name=found.name,
@@ -295,7 +295,7 @@ def _session(found: Recording, mirror: Mirror, changes: Sequence[StateChange], w
 def _survey(folder: RunFolder, mirror: Mirror) -> tuple[tuple[StoredPoint, ...] | None, tuple[Measured, ...]]:
     path = folder.run_dir / STORE
     if not path.is_file():
-        folder.missing.append(f"{STORE}: points, their fixes, and how the panels lie")
+        folder.missing.append(f"{STORE}: points, their fixes, and the panel alignment")
         return None, ()
     try:
         stored = read_survey(path, mirror.name)

@@ -84,7 +84,7 @@ def run_page(found: Findings) -> str:
 def _remarks(panel: PanelResult) -> str:
     left_out = ", ".join(str(point.point) for point in panel.outliers)
     is_bent = panel.shape is not None and panel.shape.is_significant
-    return "; ".join(filter(None, (left_out and f"left out: {left_out}", "bent" if is_bent else "")))
+    return "; ".join(filter(None, (left_out and f"not used: {left_out}", "bent" if is_bent else "")))
 
 
 def run_drawings(found: Findings) -> dict[str, Draw]:
@@ -252,4 +252,4 @@ def outcome_of(record: BeaconRecord) -> PointOutcome:
     if not record.statuses:
         return PointOutcome("not known", "", False)
     last = record.statuses[-1]
-    return PointOutcome(last.outcome or f"goes on, or was killed: {last.state}", last.cause, last.outcome == COMPLETE)
+    return PointOutcome(last.outcome or f"in progress, or killed: {last.state}", last.cause, last.outcome == COMPLETE)

@@ -42,7 +42,7 @@ _FIXES = {
     "deviation_um": "surface less the ideal one along its normal, > 0 towards the robot",
     "sigma_deviation_um": _SIGMA,
     "residual_um": "deviation less the fitted plane of the panel",
-    "is_outlier": "1: left out of the fit of the panel",
+    "is_outlier": "1: not used for the fit of the panel",
     "first_arrival_mm": "distance of the retroreflector from the point at the first arrival",
     "measured_at_mm": "distance of the retroreflector from the point at the fix",
 }
@@ -146,7 +146,7 @@ def panel_table(mirror: Mirror, result: SurveyResult) -> Table:
         **{f"sigma_{name}": _SIGMA for name in _FIT},
         "chi2": "chi-square of the fitted plane",
         "dof": "degrees of freedom of the fitted plane",
-        "outliers": "numbers of the points that were left out of the fit",
+        "outliers": "numbers of the points that were not used for the fit",
         **{f"{name}_um": f"move of adjuster {name}, > 0 towards the robot" for name in names},
         **{f"sigma_{name}_um": _SIGMA for name in names},
         "is_bent": "1: the curvatures of the panel are significant",

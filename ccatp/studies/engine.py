@@ -278,7 +278,7 @@ def run_campaign(study: Study, load: Load, options: CampaignOptions) -> dict[str
         return _run(study, load, options)
     except KeyboardInterrupt as error:
         raise CampaignInterrupted(
-            f"interrupted; what is done is kept in {options.out}: the same command goes on from there"
+            f"interrupted; what is done is kept in {options.out}: the same command continues from there"
         ) from error
     except OSError as error:
         raise CampaignFailed(

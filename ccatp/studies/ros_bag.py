@@ -134,7 +134,7 @@ class _Export:
         if timeline.utc_ns(0.0) is None:
             recording.warnings.append(f"{recording.path}: an older format without UTC; stamps are of the robot's clock")
         if self._left_out:
-            what = f"{self._left_out} samples have times that cannot be, and are left out"
+            what = f"{self._left_out} samples have times that cannot be, and are not used"
             recording.warnings.append(f"{recording.path}: {what}")
 
     def _ns(self, t_s: float) -> int:

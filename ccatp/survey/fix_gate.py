@@ -7,7 +7,7 @@ compared with the expected position. If they differ, the check searches for a si
 
 from collections.abc import Mapping
 from itertools import permutations, product
-from math import dist, hypot, isfinite
+from math import dist, hypot, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,10 @@ def nis_of(foot: DeckFoot, pose: DeckPose, covariance: FloatArray) -> float:
     if not np.isfinite(spread).all():
         return float("nan")
     return float(residual.dot(np.linalg.solve(spread, residual)))
+
+
+def _digits(length_mm: float) -> str:
+    return f"{length_mm:.3g}" if length_mm < 100.0 else f"{length_mm:.0f}"
 
 
 AXES = "xyz"
@@ -183,7 +187,10 @@ class FixGate:
         beyond = self._gate_nis is None and nis > _FAR * cfg.doubt_nis
         if agreeing >= (_CONSISTENT if beyond else 2):
             return ""
-        return f"it is {1e3 * hypot(foot.x_m - pose.x_m, foot.y_m - pose.y_m):.3g} mm from the estimate (NIS {nis:.3g})"
+        # In this direction the normalized innovation squared is proportional to the square of the distance.
+        distance_mm = 1e3 * hypot(foot.x_m - pose.x_m, foot.y_m - pose.y_m)
+        expected_mm = distance_mm * sqrt(cfg.doubt_nis / nis)
+        return f"it is {_digits(distance_mm)} mm from the estimate, expected at most {_digits(expected_mm)} mm"
 
     def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> str:
         """Why the laser system is refused when lengths gave no position; empty after the first fix."""

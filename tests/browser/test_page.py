@@ -268,7 +268,7 @@ async def test_messages_stand_in_the_order_of_time_and_what_is_left_out_is_said(
     ]
     (operator.folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     await operator.until(
-        "document.querySelector('.left-out')?.textContent", "50 older messages left out: see log.jsonl"
+        "document.querySelector('.left-out')?.textContent", "50 older messages are not shown: see log.jsonl"
     )
     times = await operator.page.evaluate("[...document.querySelectorAll('#log time')].map(time => time.textContent)")
     assert times == [f"11-26 03:{k // 60:02}:{k % 60:02}Z" for k in range(249, 49, -1)]

@@ -507,7 +507,7 @@ async def test_what_a_page_shows_and_that_its_end_is_not_that_of_the_survey(runt
             await is_laid_out(page)
             await takes_a_token(page, rig)
         await expect(page.locator("#alarm")).to_contain_text("LINK LOST")
-        await expect(page.locator("#alarm-text")).to_have_text("the dashboard has ended; the survey may go on")
+        await expect(page.locator("#alarm-text")).to_have_text("the dashboard has ended; the survey may continue")
         await expect(page.locator("#ended")).to_be_hidden()
         await expect(page.locator("#abort")).to_be_disabled()
         await browser.close()

@@ -1,6 +1,6 @@
 """Every command that reads a recording, over recordings with restarts, clock steps, wraps and damaged chunks.
 
-Each result is right (that of the whole recording), or reported (a line says what was left out, or the command refuses
+Each result is right (that of the whole recording), or reported (a line says what was not used, or the command refuses
 with a line); silently wrong is none.
 """
 
@@ -48,7 +48,7 @@ class Answer:
         return any(word in self.err for word in words)
 
 
-LOSSES = ("damaged or cut off", "frames are missing", "cannot be joined", "left out")
+LOSSES = ("damaged or cut off", "frames are missing", "cannot be joined", "not used")
 
 
 def poses(path: Path) -> FloatArray:

@@ -117,7 +117,7 @@ def test_the_dashboard_is_restarted_and_clients_pause_resume_and_call_home(start
     assert latched.code == 2
     # At base the daemon ends; requests then time out, and its exit status says the rest.
     assert run.wait() == 3
-    assert "process dashboard was killed by SIGKILL: restarting it, the survey goes on" in run.stderr
+    assert "process dashboard was killed by SIGKILL: restarting it, the survey continues" in run.stderr
     shown = re.search(r"dashboard: http://127\.0\.0\.1:\d+/\?token=([0-9a-f]{32})\n", run.stderr)
     assert shown is not None
     assert shown[1] == page.token  # after the restart, too

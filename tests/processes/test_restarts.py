@@ -206,7 +206,7 @@ def test_a_service_that_is_restarted_refuses_what_is_damaged_and_waits_for_an_op
     status = again.until(lambda status: status["seq"] >= 0)
     measured("P4", time.monotonic() - again_s)
     assert (status["state"], status["done"]) == ("held", done)
-    text = f"restarted: {done} points are measured and will be left out, {9 - done} are to do; 'ccatp resume' goes on"
+    text = f"restarted: {done} points are measured and will be skipped, {9 - done} are to do; 'ccatp resume' continues"
     assert status["cause"].startswith(text)
     assert status["point"]
     time.sleep(0.3)

@@ -98,7 +98,7 @@ def test_ctrl_c_keeps_what_is_done(started: Callable[..., subprocess.Popen[str]]
     assert run.returncode == 130
     assert stdout == ""
     assert stderr.splitlines()[-1] == (
-        f"ccatp: interrupted; what is done is kept in {tmp_path}: the same command goes on from there"
+        f"ccatp: interrupted; what is done is kept in {tmp_path}: the same command continues from there"
     )
     assert "Traceback" not in stderr
     assert keys_of(tmp_path)

@@ -253,7 +253,7 @@ def test_of_several_runs_one_is_chosen(
     with locked(tmp_path / LOCK_FILE, ""), locked(beside / LOCK_FILE, ""):
         err = refused(capsys, *command)
     choice = f"{tmp_path} (starts), {beside} (tonight)"
-    assert err == f"ccatp: 2 runs go on; choose one with --runtime-dir: {choice}\n"
+    assert err == f"ccatp: 2 runs are in progress; choose one with --runtime-dir: {choice}\n"
     with locked(beside / LOCK_FILE, ""):
         assert configured_folder(None, None) == beside
 

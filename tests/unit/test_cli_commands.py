@@ -159,7 +159,7 @@ def test_the_table() -> None:
     assert status_rows(STATUS) == [
         ("state", "driving 3-4-5"),
         ("points", f"120 of 693 measured, 3 skipped  [{'#' * 5}{'.' * 25}]"),
-        ("time", "12:34 elapsed, 1:01:40 to go, no path takes less than 50:00"),
+        ("time", "12:34 elapsed, 1:01:40 remaining, minimum 50:00"),
         ("arrival", "0.05 mm from the last point, as estimated"),
         ("danger", "0 normal"),
     ]
@@ -175,10 +175,10 @@ def test_the_table() -> None:
         >= {
             "cause": "operator",
             "danger": "2 operation aborted",
-            "late frames": "4, the latest by 31 ms",
-            "left out: out of time": "1-2-3, 1-2-4",
-            "left out: operator": f"93 points: {first}, ...",
-            "over": "with exit status 4",
+            "late frames": "4, worst 31 ms",
+            "not measured: out of time": "1-2-3, 1-2-4",
+            "not measured: operator": f"93 points: {first}, ...",
+            "exit status": "4",
             "outcome": "stopped",
         }.items()
     )
@@ -187,7 +187,7 @@ def test_the_table() -> None:
 def test_what_holds_the_robot_is_shown_with_severity_duration_and_advice() -> None:
     wheel = {**STATUS, "state": "held", "cause": WHEEL_BLOCKED.text(side="left"), "t_s": 95.0, "since_s": 20.0}
     shown = dict(status_rows(wheel))
-    assert (shown["severity"], shown["since"], shown["what to do"]) == ("hold", "1:15 ago", WHEEL_BLOCKED.advice)
+    assert (shown["severity"], shown["for"], shown["what to do"]) == ("hold", "1:15", WHEEL_BLOCKED.advice)
     assert dict(status_rows({**wheel, "severity": int(Severity.FAULT)}))["severity"] == "fault"  # it has escalated
     paused = dict(status_rows({**wheel, "cause": "operator"}))
     assert "severity" not in paused
@@ -196,7 +196,7 @@ def test_what_holds_the_robot_is_shown_with_severity_duration_and_advice() -> No
 
 
 def test_one_line() -> None:
-    assert status_line(STATUS) == "18 %: 120 of 693 points, driving 3-4-5, 12:34 elapsed, 1:01:40 to go"
+    assert status_line(STATUS) == "18 %: 120 of 693 points, driving 3-4-5, 12:34 elapsed, 1:01:40 remaining"
     assert "held (operator)" in status_line({**STATUS, "state": "held", "point": "", "cause": "operator"})
     assert status_line({}).startswith("0 %: 0 of 0 points")
     assert [clock(s) for s in (-1.0, 0.4, 59.6, 3600.0)] == ["0:00", "0:00", "1:00", "1:00:00"]

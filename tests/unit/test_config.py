@@ -467,7 +467,7 @@ def test_runs_with_how_they_ended(tmp_path: Path, capsys: pytest.CaptureFixture[
     runs = json.loads(capsys.readouterr().out)["runs"]
     assert [(run["run"][-1], run["state"], run["points"], run["what"]) for run in runs] == [
         ("a", "held", "2/9", "fyst-m1, hard, simulated"), ("c", "not finished", "", "fyst-m1"),
-        ("d", "going on", "", "fyst-m1"), ("b", "complete", "9/9", "fyst-m1, hard, simulated"),
+        ("d", "running", "", "fyst-m1"), ("b", "complete", "9/9", "fyst-m1, hard, simulated"),
     ]  # fmt: skip
     assert printed(capsys, "runs", "list", tmp_path).splitlines()[1].split() == [
         "2026-01-02T00:00:00", "held", "2/9", "0.3", "fyst-m1,", "hard,", "simulated", str(tmp_path / "a"),

@@ -120,7 +120,7 @@ def test_what_cannot_be_read_is_left_out_and_told_once(tmp_path: Path, config_te
     (recording,) = open_run(tmp_path)
     assert len(list(recording.messages())) == 1
     (warning,) = recording.warnings
-    assert "what cannot be read is left out" in warning
+    assert "what cannot be read is not used" in warning
 
 
 def test_a_torn_file_is_read_up_to_its_damage(tmp_path: Path, config_text: str) -> None:
@@ -303,7 +303,7 @@ def test_a_damaged_fix_is_left_out(survey_dir: Path) -> None:
         db.commit()
     found = read_run(survey_dir, {})
     assert [one.point.point for one in found.measured] == [1, 3, 4, 5]
-    assert found.warnings == ("point 3/7/2: its stored fix is damaged and left out; measure it again",)
+    assert found.warnings == ("point 3/7/2: its stored fix is damaged and not used; measure it again",)
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def _left_out_heights(
     heights_m = [place[2] for place in places_m.values() if len(place) > dimension]
     if heights_m and (spread_m := max(heights_m) - min(heights_m)) > least_m:
         yield (
-            f"{option}: z_m, which differs by {spread_m:.3g} m, is left out of a map in 2 dimensions; --dimension 3 "
+            f"{option}: z_m, which differs by {spread_m:.3g} m, is not used for a map in 2 dimensions; --dimension 3 "
             "maps in space"
         )
 
@@ -333,7 +333,7 @@ def report_lines(data: dict[str, Any]) -> Iterator[str]:
     rms = data["rms_m"]
     yield f"  error, median (10 to 90 %)         {_mm(rms['p50'])} ({_mm(rms['p10'])} to {_mm(rms['p90'])})"
     if data.get("motes_in_doubt"):
-        yield f"  motes in doubt                     {data['motes_in_doubt']}"
+        yield f"  uncertain motes                    {data['motes_in_doubt']}"
         yield f"  error of the others                {_mm(data['rms_of_others_m'])}"
     yield f"  expected by the estimator          {_mm(data['expected_rms_m'])}"
     if (advice := data.get("measure_next")) is not None:

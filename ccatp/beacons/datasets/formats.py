@@ -249,7 +249,7 @@ def _subjects(folder: Path, barcodes: FloatArray, warnings: list[str]) -> FloatA
     if unknown.any():
         codes = listed([str(int(code)) for code in np.unique(barcodes[unknown])])
         count = plural(int(unknown.sum()), "reading")
-        warnings.append(f"{count} of barcodes that {file.name} does not list ({codes}), left out")
+        warnings.append(f"{count} of barcodes that {file.name} does not list ({codes}), not used")
     return subjects
 
 
@@ -424,7 +424,7 @@ def _in_the_plane(readings: Readings, above_m: FloatArray, warnings: list[str]) 
     """Ranges projected to the plane. ``above_m``: height of each beacon above the antenna, shape (b,)."""
     squares = readings.range_m**2 - above_m[readings.beacon] ** 2
     if (short := (squares < 0.0) & (readings.range_m > 0.0)).any():
-        warnings.append(f"{plural(int(short.sum()), 'range')} shorter than the beacon is above the antenna, left out")
+        warnings.append(f"{plural(int(short.sum()), 'range')} shorter than the beacon is above the antenna, not used")
         readings = readings.where(~short)
         squares = squares[~short]
     level_m = np.where(above_m[readings.beacon] == 0.0, readings.range_m, np.sqrt(np.maximum(squares, 0.0)))

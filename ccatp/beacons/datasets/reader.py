@@ -119,7 +119,7 @@ def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
     readings = run.readings
     if (nothing := readings.range_m == 0.0).any():  # some units write 0 if they received no reply
         first_s = readings.times_s[np.argmax(nothing)]
-        left_out.append(f"{plural(int(nothing.sum()), 'range')} of 0 m, the first at {first_s:.6g} s, left out")
+        left_out.append(f"{plural(int(nothing.sum()), 'range')} of 0 m, the first at {first_s:.6g} s, not used")
         readings = readings._replace(range_m=np.where(nothing, np.nan, readings.range_m))
     for field, what, most, unit in LIMITS:
         column = getattr(readings, field)
@@ -128,7 +128,7 @@ def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
             first = int(np.flatnonzero(beyond)[0])
             left_out.append(
                 f"{plural(int(beyond.sum()), what)} beyond {most:g} {unit}, the first {column[first]:.3g} {unit} at "
-                f"{readings.times_s[first]:.6g} s, left out"
+                f"{readings.times_s[first]:.6g} s, not used"
             )
             readings = readings._replace(**{field: np.where(beyond, np.nan, column)})
     if left_out:
@@ -141,7 +141,7 @@ def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
         if all(abs(axis_m) <= FARTHEST_M for axis_m in place_m)
     }
     if lost := [name for name in run.beacon_truth_m if name not in placed]:
-        left_out.append(f"surveyed place of {', '.join(lost)}: is no place within {FARTHEST_M:g} m, left out")
+        left_out.append(f"surveyed place of {', '.join(lost)}: is no place within {FARTHEST_M:g} m, not used")
     return replace(run, readings=readings, beacon_truth_m=placed, warnings=(*run.warnings, *left_out))
 
 

@@ -118,7 +118,7 @@ class Table(NamedTuple):
         """Rows that are finite in the first ``columns`` (default: all); the others are dropped with a warning."""
         finite = np.asarray(np.isfinite(self.values[:, :columns]).all(axis=1))
         if not finite.all():
-            warnings.append(self.note(~finite, "not finite (the first here), left out"))
+            warnings.append(self.note(~finite, "not finite (the first here), not used"))
         return Table(self.file, self.values[finite], self.lines[finite])
 
     def in_order(self, warnings: list[str], columns: int | None = None) -> "Table":
@@ -140,7 +140,7 @@ class Table(NamedTuple):
             first = int(np.searchsorted(values[:, 0], values[row, 0]))
             keep[row] = not any(np.array_equal(values[k], values[row], equal_nan=True) for k in range(first, row))
         if not keep.all():
-            warnings.append(Table(file, values, lines).note(~keep, "doubled (the first here), left out"))
+            warnings.append(Table(file, values, lines).note(~keep, "doubled (the first here), not used"))
         return Table(file, values[keep], lines[keep])
 
     def with_unknown_ways(self, warnings: list[str]) -> "Table":
@@ -227,7 +227,7 @@ def within(times_s: FloatArray, odometry_s: FloatArray, what: str, warnings: lis
     """Mask of the times within the span of the odometry; warns of the others."""
     inside = (times_s >= odometry_s[0]) & (times_s <= odometry_s[-1])
     if not inside.all():
-        warnings.append(f"{plural(int((~inside).sum()), what)} before the first or after the last odometry, left out")
+        warnings.append(f"{plural(int((~inside).sum()), what)} before the first or after the last odometry, not used")
     return np.asarray(inside)
 
 

@@ -239,7 +239,7 @@ def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) 
     readings = nis.size + refused
     if slam.jumps > DOUBTFUL_JUMPS * readings:
         why = "pushed, beacons misread, or odometry that misses something?"
-        yield f"the pose had to be doubted {slam.jumps} times: {why}"
+        yield f"the pose was uncertain {slam.jumps} times: {why}"
     if refused > DOUBTFUL_SHARE * readings:
         yield f"{refused} of {readings} readings were refused: do they belong to this odometry?"
 

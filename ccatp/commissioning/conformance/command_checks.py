@@ -418,13 +418,13 @@ def _unknown_key(pair: ControllerAndMonitor) -> str:
 def _unknown_type(pair: ControllerAndMonitor) -> str:
     # More lines than the number of bad lines allowed in a second.
     _check_tolerated(pair, b'{"type":"dance","seq":7,"partner":null}\n' * STRANGERS)
-    return f"{STRANGERS} lines of an unknown type, the session goes on"
+    return f"{STRANGERS} lines of an unknown type, the session continues"
 
 
 @check_steady("bad-lines-few", "20 bad lines in a second do not close the session")
 def _few_bad_lines(pair: ControllerAndMonitor) -> str:
     _check_tolerated(pair, b"garbage\n" * TOLERATED)
-    return f"{TOLERATED} bad lines at once, the session goes on"
+    return f"{TOLERATED} bad lines at once, the session continues"
 
 
 def _many_bad_lines(line: bytes, context: CheckContext) -> str:

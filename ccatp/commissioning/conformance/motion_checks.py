@@ -183,7 +183,9 @@ def _direction(shares: Pair, allowed: Allowed, denied: Allowed, pair: Controller
         require(frame.cmd.held, f"not held {frame.cmd.permit_age:.3f} s after a permit of {_named(denied)} alone")
     pair.allowed = denied
     pair.run(STOP_S)
-    require(_is_still(pair.frames[-WINDOW:], rate_rad_s), f"wheels go on although only {_named(denied)} is allowed")
+    require(
+        _is_still(pair.frames[-WINDOW:], rate_rad_s), f"wheels keep turning although only {_named(denied)} is allowed"
+    )
     return f"held when denied; allowed, the wheels turn at {seen[0]:.2f}, {seen[1]:.2f} rad/s"
 
 

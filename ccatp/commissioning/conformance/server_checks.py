@@ -208,7 +208,7 @@ def _refused_is_harmless(pair: ControllerAndMonitor) -> str:
         require(
             not (frame.cmd.held and is_fresh), f"the holder's drive of {frame.cmd.age:.3f} s is held after a refusal"
         )
-    return f"{refused} refused, {len(pair.frames) - first} frames of the holders go on"
+    return f"{refused} refused, {len(pair.frames) - first} frames of the holders continue"
 
 
 @check_steady(

@@ -72,7 +72,7 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool) -> dict[str, Any]:
             "arrival": [[1e3 * cfg.mission.arrival_tolerance_m, "limit"]],
             "error": [[1e3 * cfg.mission.arrival_tolerance_m, "limit"]],
             "jump": [],
-            "nis": [[1.0, "expected"], [cfg.etalon.doubt_nis / FIX_DEGREES, "doubted above"]],
+            "nis": [[1.0, "expected"], [cfg.etalon.doubt_nis / FIX_DEGREES, "measured again above"]],
         },
         "limits": {
             "charge": cfg.health.battery_reserve,

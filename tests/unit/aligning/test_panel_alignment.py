@@ -482,13 +482,13 @@ def test_the_json_is_that_of_the_contract(run_dir: Path, capsys: pytest.CaptureF
 def test_the_table_tells_the_same(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["align", str(run_dir)]) == 0
     out, err = capsys.readouterr()
-    assert "fyst-m1, simulation, world thesis, seed 1\n11 of 27 points measured, 1 of them left out\n" in out
+    assert "fyst-m1, simulation, world thesis, seed 1\n11 of 27 points measured, 1 of them not used\n" in out
     assert "\n3/7         8 " in out
-    assert "left out: 3/7/6" in out
+    assert "not used: 3/7/6" in out
     assert "panel 3/8 not determined: 2 of 3 points that it takes\n1 panel not measured\n" in out
     assert "half-wavefront error" in out
     assert "inside its 99 % band" in out
-    assert err == "ccatp: warning: panel 3/7: left out as outliers: 3/7/6; measure them again\n"
+    assert err == "ccatp: warning: panel 3/7: not used, because they are outliers: 3/7/6; measure them again\n"
 
 
 def test_a_survey_without_a_panel_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -228,7 +228,7 @@ def test_a_fix_whose_lengths_contradict_each_other_is_no_pass() -> None:
             replace(fix, metrology="unreliable", suspects=(2, 7)),
             "the lengths contradict each other: channels 2 7",
         ),
-        (replace(fix, metrology="good", left_out=(3,)), "left out: channels 3"),
+        (replace(fix, metrology="good", left_out=(3,)), "not used: channels 3"),
         (replace(fix, metrology="unchecked"), "too few lengths to contradict each other"),
     ):
         result = check_fix(cfg, mirror, one)

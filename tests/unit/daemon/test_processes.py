@@ -101,8 +101,8 @@ def children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: Config, sa
 @pytest.mark.parametrize(
     ("status", "first", "last", "restarts"),
     [
-        (1, "ended with status 1: restarting it, the survey goes on", "more than 3 times within 60 s", 3),
-        (2, "ended with status 2: the survey goes on without it", "the survey goes on without it", 0),  # final
+        (1, "ended with status 1: restarting it, the survey continues", "more than 3 times within 60 s", 3),
+        (2, "ended with status 2: the survey continues without it", "the survey continues without it", 0),  # final
     ],
 )
 def test_a_process_that_is_not_needed(
@@ -240,8 +240,8 @@ def test_a_crash_loop_ends_and_rare_deaths_do_not() -> None:
         (MAIN, 1, "", RESTART, "main ended with status 1: restarting it, wheels held meanwhile"),
         (MAIN, -40, "", RESTART, "main was killed by signal 40: restarting it, wheels held meanwhile"),
         (MAIN, -9, "hung", RESTART, "main hung: restarting it, wheels held meanwhile"),
-        (PAGE, -9, "", RESTART, "page was killed by SIGKILL: restarting it, the survey goes on"),
-        (PAGE, 2, "", WITHOUT, "page ended with status 2: the survey goes on without it"),
+        (PAGE, -9, "", RESTART, "page was killed by SIGKILL: restarting it, the survey continues"),
+        (PAGE, 2, "", WITHOUT, "page ended with status 2: the survey continues without it"),
     ],
 )
 def test_the_decision_on_a_death(spec: ProcessSpec, code: int, why: str, end: ProcessEnd, text: str) -> None:

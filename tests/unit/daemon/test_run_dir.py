@@ -104,8 +104,8 @@ def test_a_port_in_use(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "why"),
     [
-        ({"resume": True}, "--resume: a mission among beacons has nothing to go on with"),
-        ({"recover": True}, "--resume-last: a mission among beacons has nothing to go on with"),
+        ({"resume": True}, "--resume: a mission among beacons cannot be resumed"),
+        ({"recover": True}, "--resume-last: a mission among beacons cannot be resumed"),
         ({"faults_file": Path("plan.toml")}, "--faults: plans are for surveys"),
     ],
 )

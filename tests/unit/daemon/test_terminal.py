@@ -44,7 +44,7 @@ def test_a_run_from_its_first_line_to_its_report(tmp_path: Path, capsys: pytest.
     first, *lines, danger, report = told.err.splitlines()
     assert first == f"ccatp SIMULATION of fyst-m1, world thesis, seed 1, filter ekf; writing {folder}"
     assert lines == [
-        "10 %: 1 of 10 points, driving, 1:01 elapsed, 0:09 to go",
+        "10 %: 1 of 10 points, driving, 1:01 elapsed, 0:09 remaining",
         "info: first pose at 0.01 s: panel 2-3, x 0.1000 m, y 0.2000 m, heading 0.3000 rad",
         "error: held",
     ]
@@ -99,7 +99,7 @@ def test_a_verdict_is_shown_again_only_after_another_one(tmp_path: Path, capsys:
 def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     survey = RunView(CFG, is_sim=False, run_dir=tmp_path)
     at_point = replace(STATUS, point="1-2-3", error_mm=0.5)
-    assert survey.text_of(at_point) == "driving 1-2-3, 1:01 elapsed, 0:09 to go, arrival 0.50 mm"
+    assert survey.text_of(at_point) == "driving 1-2-3, 1:01 elapsed, 0:09 remaining, arrival 0.50 mm"
     beacons = RunView(load_radio_config(None), is_sim=True, run_dir=tmp_path)
     held = replace(STATUS, cause="operator", state="held", error_mm=25.0)
     assert beacons.text_of(held) == "held (operator), 1:01 elapsed, position known to 2.5 cm"
@@ -114,7 +114,7 @@ def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.Captur
     ("state", "cause", "text"),
     [
         (MissionState.HELD, "operator", "held: operator"),
-        (MissionState.TURNING, "", "going on: turning"),
+        (MissionState.TURNING, "", "resumed: turning"),
         (MissionState.RETURNING, "fire", "returning: fire"),
         (MissionState.HELD, "", "held"),
     ],
@@ -166,7 +166,7 @@ def test_a_few_of_each_kind_are_told_and_errors_all() -> None:
     sparing = RateLimitedLog(2, 10.0)
     told = [sparing.take("warning", f"held: {k} ms late", 0.1 * k) for k in range(50)]
     assert told == ["held: 0 ms late", "held: 1 ms late", *[None] * 48]
-    assert sparing.take("warning", "going on: turning", 5.0) == "going on: turning"
+    assert sparing.take("warning", "resumed: turning", 5.0) == "resumed: turning"
     assert sparing.take("info", "held: 9 ms late", 5.0) == "held: 9 ms late"
     assert sparing.take("warning", "held: 7 ms late", 10.5) == "held: 7 ms late (48 more times)"
     assert [sparing.take("error", "broken", 0.0) for _ in range(9)] == ["broken"] * 9

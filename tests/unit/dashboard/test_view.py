@@ -160,16 +160,16 @@ def test_a_line_that_comes_again_is_one_row_with_its_newest_text_and_old_ones_go
     lines.add("0.5", "warning", "process main was killed")
     for k in range(300):
         lines.add(str(k), "warning", f"held: a frame was served {k} ms late")
-        lines.add(str(k), "warning", "going on: turning")
+        lines.add(str(k), "warning", "resumed: turning")
         if k == 9:
             lines.take_new()
     late = ("299", "warning", "held: a frame was served 299 ms late", 300, 2)
-    going = ("299", "warning", "going on: turning", 300, 3)
+    going = ("299", "warning", "resumed: turning", 300, 3)
     assert lines.rows == [("0.5", "warning", "process main was killed", 1, 1), late, going]
     assert (lines.take_new(), lines.take_new()) == ([late, going], [])
     for text in ("x", "y"):
         lines.add("300", "info", text)
-    assert [row[2] for row in lines.rows] == ["going on: turning", "x", "y"]
+    assert [row[2] for row in lines.rows] == ["resumed: turning", "x", "y"]
     assert lines.left_out == 301  # the 300 that were late, and the one that was killed
 
 

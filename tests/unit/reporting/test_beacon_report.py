@@ -111,7 +111,7 @@ def test_a_run_that_was_killed_says_what_it_lacks(tmp_path: Path) -> None:
     whole = (run_dir / "telemetry.mcap").read_bytes()
     (run_dir / "telemetry.mcap").write_bytes(whole[: int(0.7 * len(whole))])
     record = read_beacon_record(run_dir)
-    assert record.missing == ("summary.json: the run goes on, or was killed before its end",)
+    assert record.missing == ("summary.json: the run is in progress, or was killed before its end",)
     assert any("telemetry.mcap" in warning for warning in record.warnings)
     Markup(beacon_page(record))
     for name in ("telemetry.mcap", "log.jsonl"):

@@ -147,11 +147,11 @@ def test_a_run_that_was_killed(without: Callable[..., Path]) -> None:
     before = {path.name: path.read_bytes() for path in run_dir.iterdir()}
     found = read_record(run_dir)
     assert {path.name: path.read_bytes() for path in run_dir.iterdir()} == before  # nothing is written
-    assert found.missing == ("summary.json: the run goes on, or was killed before its end",)
+    assert found.missing == ("summary.json: the run is in progress, or was killed before its end",)
     torn, line = sorted(found.warnings, reverse=True)
     assert torn.startswith("telemetry.mcap: damaged or cut off at byte ")
     assert torn.endswith("; the rest is in this report")
-    assert line == "log.jsonl: 1 lines cannot be read and are left out"
+    assert line == "log.jsonl: 1 lines cannot be read and are not used"
     assert len(only(found).track.seq) > 500
     ended = findings_of(found).outcome
     assert (ended.text, ended.is_good) == ("no end is recorded", False)
@@ -172,8 +172,8 @@ def test_what_is_missing_is_told(without: Callable[..., Path]) -> None:
     assert found.missing == (
         "log.jsonl: log of the processes, and when the mission changed its state",
         "telemetry.mcap: path, estimates, arrivals and fixes over time",
-        "mission.sqlite: points, their fixes, and how the panels lie",
-        "summary.json: the run goes on, or was killed before its end",
+        "mission.sqlite: points, their fixes, and the panel alignment",
+        "summary.json: the run is in progress, or was killed before its end",
     )
     assert (found.is_simulation, found.points, found.sessions) == (None, None, ())
 
@@ -201,8 +201,8 @@ def test_messages_of_another_version_are_left_out(run_dir: Path, monkeypatch: py
     recorder.write("fix", 1.0, b'{"seq":1,"t_s":1.0,"where":"here"}')
     recorder.close()
     lost, other = read_record(run_dir).warnings
-    assert lost.startswith("telemetry.mcap: 1 messages cannot be read and are left out: topic fix: ")
-    assert other.startswith("telemetry.mcap: its estimates are not of this mirror and are left out: ")
+    assert lost.startswith("telemetry.mcap: 1 messages cannot be read and are not used: topic fix: ")
+    assert other.startswith("telemetry.mcap: its estimates are not of this mirror and are not used: ")
 
     def refuse(path: Path) -> dict[str, str]:
         raise PermissionError(13, "Permission denied", str(path))
@@ -249,7 +249,7 @@ def test_the_log_tells_states_by_session(tmp_path: Path, run: str, state: str) -
     path.write_text("\n".join((run, state % (3, "idle", "turning"), "torn {", run, *later, "")))
     warnings: list[str] = []
     read = list(read_log(path, warnings))
-    assert warnings == ["log.jsonl: 1 lines cannot be read and are left out"]
+    assert warnings == ["log.jsonl: 1 lines cannot be read and are not used"]
     first, second = changes_of(read, 2)
     assert [tuple(change) for change in first] == [(3, "idle", "turning")]
     assert second == ()  # the frames count anew: their times are not known
@@ -266,7 +266,7 @@ VERDICT = {
 }
 OLD = {"process": "main", "event": "fault", "level": "warning", "wall": "w", "t_s": 3, "lag_s": 0.05, "why": ""}
 LATE = {"logger": "main", "event": "frame_late", "level": "warning", "timestamp": "x", "lateness_ms": 51.0}
-SAID = {"logger": "main", "event": "operator_message", "level": "info", "timestamp": "x", "text": "going on: 1_2"}
+SAID = {"logger": "main", "event": "operator_message", "level": "info", "timestamp": "x", "text": "resumed: 1_2"}
 COUNTS = {
     "logger": "danger", "event": "danger_statistics", "edges": {"front_left": 2}, "held": True, "denied": {},
     "names": ["a", "b"],
@@ -282,7 +282,7 @@ def test_the_log_is_shown_in_words_and_without_what_is_for_debugging(tmp_path: P
     assert shown[:3] == [
         ("w", 3.0, "warning", "main", "fault: lag 0.05 s"),
         ("x", None, "warning", "main", "frame late: lateness 51 ms"),
-        ("x", None, "info", "main", "going on: 1_2"),
+        ("x", None, "info", "main", "resumed: 1_2"),
     ]
     assert [line[-1] for line in shown[3:]] == [
         "danger: estimate stale: 0.31 s (limit 0.15 s), event code 0",

@@ -109,7 +109,7 @@ def test_the_outcome_comes_first_in_plain_words(recorded: Path, tmp_path: Path) 
     head = plain(run_page(cut_short).partition("<nav>")[0])
     assert "aborted, at base : the observatory wants the robot home. " in head
     assert "0 of 77 panels (1 of 693 points)" in head
-    assert "How the panels lie is not determined." in head
+    assert "The panel alignment is not determined." in head
 
 
 def test_text_stays_text(without: Callable[..., Path]) -> None:
@@ -329,7 +329,7 @@ def test_the_end_of_a_long_log_is_shown_too() -> None:
     calm = [line(f"note {k}", "info") for k in range(1000)]
     folded = events_body([*CLEAN[:2], *calm, *CLEAN[2:]]).split("<details>")[1]
     assert folded.index("joined") < folded.index(OVER) < folded.index("lost")
-    assert "606 lines are left out here: see log.jsonl." in folded
+    assert "606 lines are not shown here: see log.jsonl." in folded
 
 
 def test_a_page_stays_small_however_much_went_wrong(run_dir: Path) -> None:
@@ -351,7 +351,7 @@ def test_a_page_stays_small_however_much_went_wrong(run_dir: Path) -> None:
     words = plain(large)
     assert "and 4400 more." in words  # of 4500 problems
     assert "and 8900 more kinds of such lines: see log.jsonl." in words
-    assert re.search(r"96\d\d lines are left out here: see log\.jsonl\.", words)
+    assert re.search(r"96\d\d lines are not shown here: see log\.jsonl\.", words)
 
 
 # -- the commands -----------------------------------------------------------------------------------------------------

@@ -199,7 +199,7 @@ KEYS = [f"speed_m_s={v},seed={seed}" for v in SPEEDS_M_S for seed in (1, 2, 3)]
         ),
         pytest.param(
             f"{KEYS[-1]}:interrupt", 1, CampaignInterrupted,
-            "interrupted; what is done is kept in .*: the same command goes on from there", [5], id="Ctrl-C",
+            "interrupted; what is done is kept in .*: the same command continues from there", [5], id="Ctrl-C",
         ),
         pytest.param(
             f"{KEYS[-1]}:die", 2, CampaignFailed,

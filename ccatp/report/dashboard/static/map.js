@@ -102,7 +102,7 @@ export class MapView {
     this.ellipseButton.hidden = !this.ground.panels.length;
     this.ellipseButton.textContent = `3σ ×${this.magnified}`;
     const tolerance = `${this.ground.arrival_tolerance_mm} mm`;
-    const ofSurvey = [["○", "todo", "planned"], ["●", "good", `within ${tolerance}`], ["▲", "warn", `beyond ${tolerance}`], ["✕", "warn", "left out"]];
+    const ofSurvey = [["○", "todo", "planned"], ["●", "good", `within ${tolerance}`], ["▲", "warn", `beyond ${tolerance}`], ["✕", "warn", "not measured"]];
     const ofRoom = [["○", "todo", "waypoint"], ["●", "good", "reached"], ["▲", "estimate", "beacon"]];
     const items = [
       ...(this.ground.panels.length ? ofSurvey : ofRoom),

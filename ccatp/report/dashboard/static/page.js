@@ -122,7 +122,7 @@ function showEnd({ outcome, state, done, total }) {
 function showSilence() {
   const silent = performance.now() - receivedAt;
   if (isEnded || !(isDashboardGone || silent > SILENCE_MS)) return;
-  const what = isDashboardGone ? "the dashboard has ended; the survey may go on" : "the dashboard does not answer";
+  const what = isDashboardGone ? "the dashboard has ended; the survey may continue" : "the dashboard does not answer";
   showLoss([[what, silent / 1000]]);
 }
 setInterval(showSilence, 100);
@@ -338,7 +338,7 @@ function showLog({ log, messages_left_out }, isAll) {
     note = Object.assign(document.createElement("li"), { className: "left-out" });
     list.append(note);
   }
-  note.textContent = `${messages_left_out.toLocaleString("en")} older messages left out: see log.jsonl`;
+  note.textContent = `${messages_left_out.toLocaleString("en")} older messages are not shown: see log.jsonl`;
 }
 
 // -- keys ---------------------------------------------------------------------------------------------------------

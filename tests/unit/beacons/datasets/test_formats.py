@@ -441,7 +441,7 @@ def test_clocks_that_were_set_and_antennas_at_no_place(tmp_path: Path, lines: tu
 
 def test_a_range_that_is_shorter_than_the_height(tmp_path: Path) -> None:
     run = read_run(write_lines(tmp_path / "a.csv", small("beacon,a,1,1,3.5", "antenna,0,0,0.5")), None, None)
-    assert "1 range shorter than the beacon is above the antenna, left out" in run.warnings
+    assert "1 range shorter than the beacon is above the antenna, not used" in run.warnings
     assert run.readings.range_m.tolist() == [4.0]  # of 5 m, 3 m above
 
 
