@@ -255,7 +255,7 @@ async def test_the_ellipse_has_one_named_scale_until_another_is_chosen(operator:
         await operator.page.locator("#ellipse").click()
 
 
-async def test_messages_stand_in_the_order_of_time_and_what_is_left_out_is_said(operator: Operator) -> None:
+async def test_messages_are_in_the_order_of_time_and_omissions_are_reported(operator: Operator) -> None:
     word = iter(f"message {chr(97 + k // 26)}{chr(97 + k % 26)}" for k in range(250))
     lines = [
         {

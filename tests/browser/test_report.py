@@ -121,9 +121,9 @@ def the_values_under_the_pointer_are_shown(page: "Page") -> None:
         dot.dispatch_event(
             "pointermove", {"clientX": box["x"] + box["width"] / 2, "clientY": box["y"] + box["height"] / 2}
         )
-        told = re.findall(r"m \(deck frame\): ([-\d.e]+)", page.locator("#map .wide output").text_content() or "")
-        if told:  # it is in sight
-            assert [float(value) for value in told] == pytest.approx(place, abs=0.02)  # two pixels of the whole
+        reported = re.findall(r"m \(deck frame\): ([-\d.e]+)", page.locator("#map .wide output").text_content() or "")
+        if reported:  # it is in sight
+            assert [float(value) for value in reported] == pytest.approx(place, abs=0.02)  # two pixels of the whole
             seen += 1
     assert seen >= 3
 

@@ -1,4 +1,4 @@
-"""The real dashboard at a free port, and a daemon played by the test: publishers, and an operator channel."""
+"""The real dashboard at a free port, and a simulated daemon: publishers, and an operator channel."""
 
 import asyncio
 import json

@@ -135,7 +135,7 @@ SURPRISES = (
 
 
 @pytest.mark.parametrize("error", SURPRISES, ids=lambda error: type(error).__name__)
-def test_whatever_a_check_raises_is_one_undecided_check_and_the_summary_comes(
+def test_a_check_that_raises_is_undecided_and_the_summary_is_printed(
     robot: str, error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(_: CheckContext) -> str:

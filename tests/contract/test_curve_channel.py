@@ -167,7 +167,7 @@ async def test_the_listed_get_answers_and_nobody_else_gets_in(site: Site, measur
     measured("O5", site.monitor.latch.is_latched)
 
 
-async def test_garbage_and_silence_lose_the_connection_and_harm_nobody(site: Site) -> None:
+async def test_garbage_and_silence_lose_the_connection_and_have_no_other_effect(site: Site) -> None:
     async with served(site):
         host, port = site.endpoint.removeprefix("tcp://").split(":")
         for payload in (b"GET / HTTP/1.1\r\n\r\n", b"\xff" * 100_000, b""):
@@ -208,7 +208,7 @@ async def test_the_unix_socket_serves_the_user_of_the_daemon(site: Site) -> None
 
 @pytest.mark.fault("O5")
 @pytest.mark.parametrize("ruin", ["", "[clients", "gone"])
-async def test_a_list_that_is_empty_or_unreadable_lets_nobody_in(site: Site, ruin: str) -> None:
+async def test_a_list_that_is_empty_or_unreadable_admits_no_client(site: Site, ruin: str) -> None:
     path = site.folder / "clients.toml"
     async with served(site):
         if ruin == "gone":

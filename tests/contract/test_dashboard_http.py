@@ -1,4 +1,4 @@
-"""The dashboard over HTTP: the real application on a real socket, a daemon played by the test behind it."""
+"""The dashboard over HTTP: the real application on a real socket, with a simulated daemon behind it."""
 
 import asyncio
 import contextlib
@@ -44,7 +44,7 @@ async def rig(cfg: Config, runtime_dir: Path) -> AsyncIterator[Rig]:
         yield rig
 
 
-async def test_the_page_and_all_that_it_wants_come_from_here(rig: Rig) -> None:
+async def test_the_page_and_all_that_it_needs_come_from_here(rig: Rig) -> None:
     page = await rig.ask("GET", "/")
     assert page.code == 200
     assert page.headers["content-type"] == "text/html; charset=utf-8"
@@ -109,7 +109,7 @@ async def test_the_name_of_a_token(rig: Rig) -> None:
     assert (reply.code, reply.data) == (200, {"status": "ok", "name": "operator"})
 
 
-async def test_what_there_is_not_is_told_as_the_telescope_does(rig: Rig) -> None:
+async def test_what_there_is_not_is_reported_as_the_telescope_does(rig: Rig) -> None:
     for method, path, code, message in (
         ("GET", "/nothing", 404, "bad endpoint: /nothing"),
         ("GET", "/static/none.js", 404, "bad endpoint: /static/none.js"),
@@ -254,7 +254,7 @@ async def test_a_refusal_has_its_reason(rig: Rig) -> None:
         assert (reply.code, reply.data) == (code, {"status": "error", "message": f"{command}: {why}"})
 
 
-async def test_no_daemon_is_told_within_the_time(cfg: Config, runtime_dir: Path) -> None:
+async def test_no_daemon_is_reported_within_the_time(cfg: Config, runtime_dir: Path) -> None:
     async with page_rig(cfg, runtime_dir, has_daemon=False) as rig:
         reply = await rig.ask("POST", "/abort")
     assert reply.code == 504
@@ -331,7 +331,7 @@ def log_line(text: str) -> str:
     return json.dumps(line) + "\n"
 
 
-async def test_a_page_begins_with_everything_and_goes_on_with_news(rig: Rig, runtime_dir: Path) -> None:
+async def test_a_page_begins_with_everything_and_continues_with_news(rig: Rig, runtime_dir: Path) -> None:
     await rig.until("/healthz", lambda reply: reply.code == 200)
     async with rig.page() as first:
         assert b"text/event-stream" in first.head
@@ -388,7 +388,7 @@ async def test_a_dead_loop_shows_at_once_and_a_silent_one_soon(rig: Rig) -> None
         assert state["losses"][0][1] >= 0.8
 
 
-async def test_the_end_is_told_and_comes_soon_with_a_page_open(rig: Rig) -> None:
+async def test_the_end_is_reported_and_comes_soon_with_a_page_open(rig: Rig) -> None:
     await rig.until("/healthz", lambda reply: reply.code == 200)
     async with rig.page() as page:
         await page.event()

@@ -196,7 +196,9 @@ async def test_the_same_seed_gives_the_same_bytes(world: str) -> None:
 # -- a fall -----------------------------------------------------------------------------------------------------------
 
 
-async def test_a_fall_is_reported_to_who_started_the_robot_and_not_on_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_fall_is_reported_to_the_program_that_started_the_robot_and_not_on_the_link(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     robot = survey_robot(config_of())
     monkeypatch.setattr(dataloop, "survey_robot", lambda *_: robot)
     stop, listener = asyncio.Event(), any_port()
@@ -250,7 +252,7 @@ async def test_an_unforeseen_error_ends_the_loop_aloud(config: Config) -> None:
         await writer.wait_closed()
 
 
-async def test_a_client_that_does_not_read_is_left_out_and_finds_the_newest_later(config: Config) -> None:
+async def test_a_client_that_does_not_read_is_skipped_and_finds_the_newest_later(config: Config) -> None:
     async with running(config) as rig:
         deaf = await rig.peer(JOIN_MONITOR)
         await deaf.expect("joined")

@@ -175,16 +175,16 @@ async def test_a_late_reply_never_answers_the_next_request(server: ScriptedServe
         assert client.counts["connects"] == server.connections == 2
 
 
-async def test_each_error_after_which_it_is_tried_again_is_told(
+async def test_each_error_that_is_followed_by_a_retry_is_reported(
     server: ScriptedServer, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    told: list[tuple[str, int]] = []
+    reported: list[tuple[str, int]] = []
     server.script.extend((b"garbage\r\n", silence))
     cfg = config(server.port, request_timeout_s=0.05, retries=2)
-    client = EtalonClient(cfg, CHANNELS, COLLIMATORS, lambda error, left: told.append((type(error).__name__, left)))
+    client = EtalonClient(cfg, CHANNELS, COLLIMATORS, lambda error, left: reported.append((type(error).__name__, left)))
     assert_at(await client.measure(1.0, EXPECTED), PUCK)
     await client.close()
-    assert told == [("EtalonBadReply", 1), ("EtalonTimeout", 0)]
+    assert reported == [("EtalonBadReply", 1), ("EtalonTimeout", 0)]
     assert capfd.readouterr() == ("", "")  # whoever uses it may have given standard output to JSON
 
 
@@ -284,7 +284,7 @@ async def test_lengths_that_contradict_each_other_are_refused(server: ScriptedSe
 
 
 @pytest.mark.parametrize("error_mm", [0.1, 2.0, 10.0, 300.0, 5000.0, 1e308])
-async def test_one_wrong_channel_is_left_out_and_only_it_is_named(server: ScriptedServer, error_mm: float) -> None:
+async def test_one_wrong_channel_is_not_used_and_only_it_is_named(server: ScriptedServer, error_mm: float) -> None:
     wrong = records()
     wrong[5] = wrong[5]._replace(length_mm=wrong[5].length_mm + error_mm)
     server.script.append(format_reply(ChannelData(tuple(wrong))))

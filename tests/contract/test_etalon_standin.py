@@ -205,7 +205,7 @@ class BrokenPuck:
         raise ZeroDivisionError("surprise")
 
 
-async def test_an_error_nobody_foresaw_ends_serve() -> None:
+async def test_an_error_that_is_unexpected_ends_serve() -> None:
     server = standin(BrokenPuck())
     async with running(server) as port, peer_of(port) as client:
         client.writer.write(b"latestlengthvalid,1\r\n")
@@ -215,7 +215,7 @@ async def test_an_error_nobody_foresaw_ends_serve() -> None:
         assert caught.value.subgroup(ZeroDivisionError)
 
 
-async def test_serve_lasts_until_closed_and_wants_a_start() -> None:
+async def test_serve_lasts_until_closed_and_needs_a_start() -> None:
     server = standin()
     with pytest.raises(RuntimeError, match="not started"):
         await server.serve()

@@ -208,7 +208,9 @@ FAULTS: dict[str, tuple[str, dict[str, Any]]] = {
 @pytest.mark.parametrize("way", ["to_client", "to_robot"])
 @pytest.mark.parametrize("role", ["controller", "monitor"])
 @pytest.mark.parametrize("fault", FAULTS)
-async def test_a_faulty_link_stops_nobody_and_changes_nothing(tmp_path: Path, fault: str, role: Role, way: Any) -> None:
+async def test_a_faulty_link_stops_no_mission_and_changes_nothing(
+    tmp_path: Path, fault: str, role: Role, way: Any
+) -> None:
     kind, values = FAULTS[fault]
 
     async def disturb(rig: Rig) -> None:
@@ -294,7 +296,7 @@ async def test_a_robot_that_waits_for_the_other_client_is_reported(tmp_path: Pat
 
 
 @pytest.mark.parametrize("role", ["controller", "monitor"])
-async def test_a_connection_that_is_silent_is_dropped_and_the_next_one_goes_on(
+async def test_a_connection_that_is_silent_is_dropped_and_the_next_one_continues(
     tmp_path: Path, role: Role, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(robot_loop, "LOCKSTEP_SILENCE_S", 0.6)

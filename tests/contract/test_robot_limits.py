@@ -109,14 +109,16 @@ async def test_a_client_joins_a_robot_within_the_limits_and_no_other(among_beaco
 def test_the_conformance_suite_has_the_same_limits(name: str, side: str, is_beyond: bool) -> None:
     hello: dict[str, Any] = {"lockstep": False, "frame_hz": 100.0, "ttl_s": 0.25}
     hello["robot"] = {"wheel_radius_m": 0.03, "wheel_base_m": 0.15, "max_wheel_rad_s": 8.0, "fan_floor": 0.0}
-    told = with_value(HELLO, name, value_at(LIMITS[name], side, is_beyond=is_beyond))
-    hello |= {key: getattr(told, key) for key in ("frame_hz", "ttl_s")}
-    hello["robot"] |= {key: getattr(told.robot, key) for key in ("wheel_radius_m", "wheel_base_m", "max_wheel_rad_s")}
+    reported = with_value(HELLO, name, value_at(LIMITS[name], side, is_beyond=is_beyond))
+    hello |= {key: getattr(reported, key) for key in ("frame_hz", "ttl_s")}
+    hello["robot"] |= {
+        key: getattr(reported.robot, key) for key in ("wheel_radius_m", "wheel_base_m", "max_wheel_rad_s")
+    }
     if is_beyond:
         with pytest.raises(CheckFailed):
             parse(Facts, hello)
     else:
-        assert parse(Facts, hello).ttl_s == told.ttl_s
+        assert parse(Facts, hello).ttl_s == reported.ttl_s
 
 
 def load(kind: str, overrides: dict[str, object]) -> object:

@@ -213,14 +213,14 @@ def _line(row_id: str, row: Row, kept: Record, earlier: list[str]) -> str:
 
 def _measured(row_id: str, row: Row, shown: Record) -> str:
     """The worst of all tests in each unit."""
-    told = []
+    reported = []
     for unit in row.units:
         key = f"{row_id}:{unit}"
         values = [entry["values"][key] for entry in shown.values() if key in entry["values"]]
         if values:
             worst = min(values) if unit in row.at_least else max(values)
-            told.append(f"{worst:.3g} {unit.replace('_', ' ')}")
-    return ", ".join(told) or ("kept" if shown else "")
+            reported.append(f"{worst:.3g} {unit.replace('_', ' ')}")
+    return ", ".join(reported) or ("kept" if shown else "")
 
 
 def _files(shown: Record) -> str:

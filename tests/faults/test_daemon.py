@@ -58,13 +58,13 @@ async def ended(seed: int) -> float:
 
 @pytest.mark.fault("P10")
 @pytest.mark.parametrize(("first", "count"), [(0, TIMES), pytest.param(TIMES, SLOW_TIMES, marks=pytest.mark.slow)])
-async def test_whenever_they_are_told_to_end(first: int, count: int, measured: Measured) -> None:
+async def test_whenever_they_are_commanded_to_end(first: int, count: int, measured: Measured) -> None:
     for seed in range(first, first + count):
         measured("P10", await ended(seed))
 
 
 @pytest.mark.fault("P10")
-async def test_while_a_robot_that_took_the_connection_says_nothing(measured: Measured) -> None:
+async def test_while_a_robot_that_took_the_connection_reports_nothing(measured: Measured) -> None:
     loop = asyncio.get_running_loop()
     async with running_daemon(configuration()) as daemon:
         for proxy in (daemon.to_main, daemon.to_danger):
@@ -194,13 +194,13 @@ async def test_stalls_and_blocks(measured: Measured) -> None:
         measured("L3", len(found) + len(daemon.late))
         assert len(asyncio.all_tasks()) == tasks
 
-        slips, told = daemon.main.status().missed_deadlines, len(daemon.events("frame_late"))
+        slips, reported = daemon.main.status().missed_deadlines, len(daemon.events("frame_late"))
         await daemon.until(lambda: daemon.is_driving)
         begun_s = clock()
         time.sleep(0.12)  # noqa: ASYNC251 - this is what must not happen
         await moving_again(daemon, clock() + 0.05)
         status = daemon.main.status()
-        measured("P8", 0 if status.missed_deadlines > slips and len(daemon.events("frame_late")) > told else 1)
+        measured("P8", 0 if status.missed_deadlines > slips and len(daemon.events("frame_late")) > reported else 1)
         assert status.worst_lateness_ms >= 60.0
         assert not stale(daemon, begun_s, begun_s + 0.2)
 
@@ -291,8 +291,8 @@ async def test_it_drives_on_by_verdicts_of_the_new_time_after_the_robots_clock_h
 
 @pytest.mark.fault("P21")
 async def test_a_robot_on_another_mirror_is_refused(measured: Measured) -> None:
-    told, real = configuration("fyst-m1"), configuration("fyst-m2")
-    async with running_daemon(told, real) as daemon:
+    reported, real = configuration("fyst-m1"), configuration("fyst-m2")
+    async with running_daemon(reported, real) as daemon:
         duty = daemon.robot.robot.fans.duty
         await daemon.until(daemon.main.over.is_set)
         assert daemon.main.exit_status == ExitStatus.USAGE, tell(daemon)

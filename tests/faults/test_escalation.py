@@ -81,7 +81,7 @@ def found_on_the_way(
     world: str,
     wanted: list[tuple[float, float]],
     seed: int,
-    heard: Callable[[list[EstimateMessage], int], EstimateMessage | None],
+    received: Callable[[list[EstimateMessage], int], EstimateMessage | None],
     dv_m_s: float = 0.0025,
 ) -> list[Verdict]:
     """Verdicts that found something while a robot is driven, and nothing is wrong.
@@ -102,7 +102,7 @@ def found_on_the_way(
     robot._sensors.edges.place(robot.world.plant)
     robot.command_fans(1, *cfg.robot.fan_duty)
     monitor = DangerMonitor(mirror, cfg.robot, cfg.danger, cfg.health)
-    sent, told, number, radius_m = (
+    sent, reported, number, radius_m = (
         SentDrives(cfg.robot, robot.frame_s),
         list[EstimateMessage](),
         0,
@@ -115,7 +115,7 @@ def found_on_the_way(
         frame = robot.delivered
         if frame is None:
             continue
-        estimate = heard(told, frame.seq)
+        estimate = received(reported, frame.seq)
         verdict = monitor.step(frame, estimate)
         if estimate is not None and verdict.severity is not Severity.NONE:
             found.append(verdict)
@@ -123,7 +123,7 @@ def found_on_the_way(
         omega += min(max(omega_wanted - omega, -0.025), 0.025)
         if is_estimate_due(frame.seq):
             pose = robot.world.plant.pose
-            told.append(EstimateMessage(
+            reported.append(EstimateMessage(
                 seq=frame.seq, t_s=frame.t, x_m=pose.x_m, y_m=pose.y_m, heading_rad=pose.heading_rad, sigma_m=1e-3,
                 state="driving", commanded=sent.take_span(), drive_seq=number,
             ))  # fmt: skip
@@ -142,7 +142,7 @@ def test_monitors_are_silent_where_nothing_is_wrong(
     world: str, twists: list[tuple[float, float, int]], seed: int
 ) -> None:
     wanted = [(0.0, 0.0)] * 60 + [(a, b) for a, b, count in twists for _ in range(count)] + [(0.0, 0.0)] * 60
-    assert not found_on_the_way(world, wanted, seed, lambda told, _: told[-1] if told else None)
+    assert not found_on_the_way(world, wanted, seed, lambda reported, _: reported[-1] if reported else None)
 
 
 class Waiting:
@@ -170,7 +170,7 @@ class Waiting:
         pytest.param(2, 0.05, lambda k: 95 if 100 < k < 111 else k, id="several at once"),
     ],
 )
-def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
+def test_drives_that_the_danger_loop_receives_late_have_moved_the_wheels(
     frames: int, dv_m_s: float, heard_until: Callable[[int], int], seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot that has stood for long drives on for a moment, and the estimates of that wait for the danger loop."""
@@ -181,15 +181,15 @@ def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
     waiting: deque[EstimateMessage] = ear._subscriber.messages  # type: ignore[attr-defined]
     arrived = 0
 
-    def heard(told: list[EstimateMessage], k: int) -> EstimateMessage | None:
+    def received(reported: list[EstimateMessage], k: int) -> EstimateMessage | None:
         nonlocal arrived
-        while arrived < len(told) and told[arrived].seq <= heard_until(k):
-            waiting.append(told[arrived])
+        while arrived < len(reported) and reported[arrived].seq <= heard_until(k):
+            waiting.append(reported[arrived])
             arrived += 1
         return ear.latest(k, is_lockstep=False)
 
     wanted = [(0.0, 0.0)] * 100 + [(0.1, 0.0)] * frames + [(0.0, 0.0)] * 188
-    found = found_on_the_way("hard", wanted, seed, heard, dv_m_s)
+    found = found_on_the_way("hard", wanted, seed, received, dv_m_s)
     assert arrived > 50
     assert not [one.cause for one in found if "wheel" in one.cause]
 
@@ -197,7 +197,9 @@ def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
 @pytest.mark.parametrize(
     ("seq", "t_s", "expected"), [(70, 0.7, [0.0, 4.0]), (99, 0.99, [0.0, 4.0]), (99, float("nan"), [0.0])]
 )
-def test_what_the_wheels_were_told_counts_however_old_the_estimate(seq: int, t_s: float, expected: list[float]) -> None:
+def test_the_commanded_speed_of_the_wheels_counts_however_old_the_estimate(
+    seq: int, t_s: float, expected: list[float]
+) -> None:
     cfg = load_config()
     monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
     robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(1))

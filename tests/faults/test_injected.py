@@ -243,7 +243,7 @@ def test_a_gyroscope_of_wrong_sign_or_scale_is_noticed_in_the_first_turn(kind: s
 
 @pytest.mark.fault("S9")
 @pytest.mark.parametrize("fault", ["imu_wz stuck", "imu_ax stuck", "imu_wz stuck value=34.9"])
-def test_an_inertial_unit_that_repeats_itself_is_left_out(fault: str, measured: Measured) -> None:
+def test_an_inertial_unit_that_repeats_itself_is_not_used(fault: str, measured: Measured) -> None:
     run = watched(HARD, after(DRIVING_S + 1.2), f"{fault} at_s={DRIVING_S}")
     first = run.first(DRIVING_S, slow)
     assert first.t_s - DRIVING_S <= 0.2 + 0.011  # and a frame on the link

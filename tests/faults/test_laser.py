@@ -303,7 +303,7 @@ def test_outliers_are_not_fused(name: str, tmp_path: Path, measured: Measured) -
 
 @pytest.mark.fault("E3")
 @pytest.mark.parametrize(("height_m", "is_taken"), [(0.0045, True), (-0.0055, False)])
-def test_a_puck_off_the_surface_is_not_believed(height_m: float, is_taken: bool, tmp_path: Path) -> None:
+def test_a_puck_off_the_surface_is_refused(height_m: float, is_taken: bool, tmp_path: Path) -> None:
     mirror = mirror_of()
 
     def laser(m: LaserRequest, fix: Fix) -> Fix:
@@ -325,7 +325,7 @@ def test_a_puck_off_the_surface_is_not_believed(height_m: float, is_taken: bool,
 
 @pytest.mark.fault("E4")
 @pytest.mark.parametrize("way", [(0.03, 0.0, 0.0), (0.0, -0.06, 0.0), (0.1, 0.1, 0.2)])
-def test_a_robot_put_elsewhere_is_believed_after_three_fixes(
+def test_a_robot_put_elsewhere_is_accepted_after_three_fixes(
     way: tuple[float, float, float], tmp_path: Path, measured: Measured
 ) -> None:
     dx, dy, turn = way

@@ -218,7 +218,7 @@ async def test_a_robot_that_trickles_is_given_up() -> None:
 
 
 @pytest.mark.fault("L8")
-def test_a_thousand_others_do_not_disturb_who_drives(measured: Measured) -> None:
+def test_a_thousand_connections_do_not_disturb_the_controller(measured: Measured) -> None:
     """Every frame and every set point is as without them; what they cost is their own processor time."""
     costs_s: list[float] = []
 
@@ -294,17 +294,17 @@ async def test_commands_that_come_again_are_dropped() -> None:
      "", " ccatp-robot/1", "ccatp-robot/1\u200b"],
 )  # fmt: skip
 async def test_no_other_version_is_joined(protocol: str, measured: Measured) -> None:
-    heard: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+    received: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
 
     async def speak(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(encode(HELLO).replace(PROTOCOL.encode(), protocol.encode()))
-        heard.set_result(await reader.read())
+        received.set_result(await reader.read())
 
     async with robot(speak) as (link, _):
         with pytest.raises(WrongProtocol, match="this program ccatp-robot/1"):
             await link.connect(DEADLINE_S)
         async with asyncio.timeout(DEADLINE_S):
-            measured("L12", 100.0 if await heard == b"" else 0.0)  # no join, no command
+            measured("L12", 100.0 if await received == b"" else 0.0)  # no join, no command
 
 
 # -- small messages ---------------------------------------------------------------------------------------------------

@@ -144,7 +144,7 @@ def frames(story: Story, *verdicts: Verdict, count: int = 1) -> MissionState:
 
 
 @pytest.mark.fault("O1")
-def test_during_an_earthquake_nobody_resumes(story: Story) -> None:
+def test_during_an_earthquake_resume_is_refused(story: Story) -> None:
     story.until_state(DRIVING)
     story.frame(emergency(1, "earthquake"))
     assert story.state.is_paused
@@ -167,7 +167,7 @@ def test_an_emergency_that_is_new_outranks_a_pause_and_its_level_does_not(story:
 
 
 @pytest.mark.fault("O1", "O2")
-def test_an_earthquake_at_an_edge_presses_the_robot_on_and_nobody_resumes(story: Story) -> None:
+def test_an_earthquake_at_an_edge_presses_the_robot_on_and_resume_is_refused(story: Story) -> None:
     story.until_state(DRIVING)
     shaking = emergency(1, "earthquake", code=EventCode.NEAR_EDGE)
     assert frames(story, replace(shaking, off=(True, False, False, False), forward=False)) is BACKING_OFF
@@ -334,7 +334,7 @@ def relaying(relay: Relay) -> Iterator[Relay]:
 
 
 @pytest.mark.fault("O4")
-def test_an_emergency_is_told_until_it_is_heard(relay: Relay, measured: Measured) -> None:
+def test_an_emergency_is_sent_until_it_is_received(relay: Relay, measured: Measured) -> None:
     rng, lost = random.Random(3), list[bool]()
 
     def half_of_them() -> bool:
@@ -486,7 +486,7 @@ def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(
 
 @pytest.mark.fault("O10")
 @pytest.mark.parametrize("budget_s", [45.0, 70.0])
-def test_what_does_not_fit_into_the_budget_is_left_out(budget_s: float, tmp_path: Path, measured: Measured) -> None:
+def test_points_beyond_the_budget_are_not_measured(budget_s: float, tmp_path: Path, measured: Measured) -> None:
     cfg = one_panel(run__seed=3, run__panels=2, run__budget_s=budget_s, mission__holds_to_budget=True)
     run = MeasuredSurvey(cfg, tmp_path, plan=plan_of("body slip at_s=20.0 for_s=20.0 factor=0.8"))
     result = run.run()

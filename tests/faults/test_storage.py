@@ -55,7 +55,9 @@ def test_a_whole_mirror_is_measured_on_a_disk_that_gives_nothing_more(tmp_path: 
 
 
 @pytest.mark.fault("P13")
-def test_a_log_on_a_full_disk_drops_lines_and_says_so_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_log_on_a_full_disk_drops_lines_and_reports_it_once(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     log = open_log(tmp_path / "log.jsonl", "main")
     with full_beyond(4096):
         for k in range(500):
@@ -66,7 +68,7 @@ def test_a_log_on_a_full_disk_drops_lines_and_says_so_once(tmp_path: Path, capfd
     assert "lines are dropped" in complaint
 
 
-def test_a_log_goes_on_where_there_is_room_again(tmp_path: Path) -> None:
+def test_a_log_continues_where_there_is_room_again(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     with LogStream(path, "main") as stream:
         with full_beyond(100):

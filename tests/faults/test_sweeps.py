@@ -137,7 +137,7 @@ def test_the_edge_sweep_is_every_drive_once() -> None:
         assert firsts == list(range(0, count, edge_sweep.BLOCK))
 
 
-def test_the_edge_sweep_goes_on_where_it_was_stopped(
+def test_the_edge_sweep_continues_where_it_was_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     few_drives(monkeypatch)

@@ -34,9 +34,9 @@ def test_plaza2_smoothed() -> None:
     scale, sigma = track.calibration["range_scale"]
     assert 1.0 + scale == pytest.approx(1.0693, rel=0.007)  # the slope of ranges over true distances
     assert abs(scale - 0.0693) < 3.0 * sigma
-    told = " | ".join(run.warnings)
+    reported = " | ".join(run.warnings)
     for warning in ("turned by pi", "odometry distance equals the truth", "ranges read +7.0 per cent"):
-        assert warning in told
+        assert warning in reported
 
 
 @pytest.mark.parametrize("share", [0.1, 0.4])
@@ -97,6 +97,6 @@ def test_labyrinth_smoothed() -> None:
     run, _, found = smoothed("uwb_labyrinth")
     assert found.trajectory_rmse_m is not None
     assert found.trajectory_rmse_m < 0.065
-    told = " | ".join(run.warnings)
-    assert "wheel columns by the shape of the true path: left, right, track 0.15" in told
-    assert "ranges read +5.0 per cent" in told
+    reported = " | ".join(run.warnings)
+    assert "wheel columns by the shape of the true path: left, right, track 0.15" in reported
+    assert "ranges read +5.0 per cent" in reported

@@ -19,7 +19,7 @@ from tests.support.runs import Run, wall_s
 
 
 @pytest.mark.fault("P1", "P2", "P17")
-def test_main_and_danger_are_killed_and_the_survey_goes_on(start: Start, measured: Measured) -> None:
+def test_main_and_danger_are_killed_and_the_survey_continues(start: Start, measured: Measured) -> None:
     run = start("--panels", "1")
     run.until_state("driving", done=1)
     _, main_s = run.send("main")
@@ -64,7 +64,7 @@ def test_what_is_killed_or_hangs_is_replaced(start: Start, name: str, number: si
 
 
 @pytest.mark.fault("P6", "P23")
-def test_a_main_loop_that_is_stopped_and_goes_on_decides_nothing_by_old_frames(
+def test_a_main_loop_that_is_stopped_and_continues_decides_nothing_by_old_frames(
     start: Start, measured: Measured
 ) -> None:
     run = start("--panels", "1", "--realtime")

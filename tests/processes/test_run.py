@@ -183,7 +183,7 @@ def measured_in(database: Path) -> int:
 
 
 @pytest.mark.slow
-def test_a_robot_set_down_wrongly_meets_the_rim_finds_itself_and_measures_everything(start: Start) -> None:
+def test_a_robot_placed_wrongly_meets_the_rim_is_relocalized_and_measures_every_point(start: Start) -> None:
     # Seed 8 sets the robot down 0.1 m beside base, with a sensor almost over the rim.
     run = start("--panels", "1", "--seed", "8", "--set", "world.start_position_sigma_m=0.08")
     assert run.wait() == 0, run.stderr
@@ -302,7 +302,7 @@ at_s = 20.0
 
 
 @pytest.mark.fault("L1", "L11", "L15", "F7", "S14", "S15")
-def test_a_survey_goes_on_through_injected_faults_which_the_log_names(start: Start, tmp_path: Path) -> None:
+def test_a_survey_continues_through_injected_faults_which_the_log_names(start: Start, tmp_path: Path) -> None:
     (tmp_path / "plan.toml").write_text(FAULTS)
     run = start("--panels", "1", "--faults", str(tmp_path / "plan.toml"))
     run.until(lambda status: status["done"] >= 5)  # which takes it beyond the last of them

@@ -68,7 +68,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_a_campaign_killed_at_any_instant_goes_on(
+def test_a_campaign_killed_at_any_instant_continues(
     started: Callable[..., subprocess.Popen[str]], whole: list[dict[str, Any]], tmp_path: Path
 ) -> None:
     run = started([*COMMAND, "--runs", "2", "--workers", "2", "--out", str(tmp_path)])

@@ -1,4 +1,4 @@
-"""The command line: what reaches the rooms below, what the shell is told."""
+"""The command line: the arguments that reach the commands, the output and the exit status."""
 
 import getpass
 import importlib.metadata

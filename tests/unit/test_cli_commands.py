@@ -74,8 +74,8 @@ def planned(capsys: pytest.CaptureFixture[str], *args: str, status: int = 0) -> 
 
 
 def test_every_shipped_world_is_named_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
-    told = " ".join(printed(capsys, "plan", "--help").split())
-    assert set(available("world")) <= set(re.split(r"[ ,]+", told))
+    reported = " ".join(printed(capsys, "plan", "--help").split())
+    assert set(available("world")) <= set(re.split(r"[ ,]+", reported))
 
 
 @pytest.mark.parametrize(("name", "filter_name"), [*((name, "kf") for name in NAMES), ("fyst-m1", "ekf")])

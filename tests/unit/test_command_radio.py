@@ -44,7 +44,7 @@ def said(capsys: pytest.CaptureFixture[str], *argv: object) -> tuple[int, str, s
     return status, captured.out, captured.err
 
 
-def told(capsys: pytest.CaptureFixture[str], *argv: object) -> Any:
+def reported(capsys: pytest.CaptureFixture[str], *argv: object) -> Any:
     return answered(capsys, "radio", *argv)
 
 
@@ -79,7 +79,7 @@ def test_what_is_not_known_is_null(tmp_path: Path, capsys: pytest.CaptureFixture
     file = write_plaza(tmp_path, world(seconds=30.0), mat=False)
     (tmp_path / "Field1_GT.txt").unlink()
     (tmp_path / "Field1_TL.txt").unlink()
-    data = told(capsys, "slam", file, "--filter", "smoother", "--set", "plaza.priors.range_scale=0.0")
+    data = reported(capsys, "slam", file, "--filter", "smoother", "--set", "plaza.priors.range_scale=0.0")
     unknown = ("trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "nees_mean", "range_scale")
     assert {data[key] for key in unknown} == {None}
     assert len(data["beacons"]) == len(BEACONS)
@@ -89,7 +89,7 @@ def test_a_truth_of_one_row_is_no_trajectory(tmp_path: Path, capsys: pytest.Capt
     lines = labyrinth_lines(world(seconds=30.0))
     first = next(line for line in lines if line.startswith("gt2"))
     file = write_lines(tmp_path / "lab.txt", [first, *(line for line in lines if not line.startswith("gt2"))])
-    data = told(capsys, "slam", file, "--filter", "smoother")
+    data = reported(capsys, "slam", file, "--filter", "smoother")
     assert data["trajectory_rmse_m"] is data["nees_mean"] is None
     assert data["beacon_rmse_m"] < 0.5
     assert any("no reference trajectory: the truth has 1 row" in warning for warning in data["warnings"])
@@ -134,14 +134,14 @@ def test_calibrate_prints_what_the_configuration_takes(tmp_path: Path, capsys: p
     assert (status, err) == (0, "")
     assert "reference_dbm = -44." in out
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-    found = told(capsys, "calibrate", pairs(tmp_path))
+    found = reported(capsys, "calibrate", pairs(tmp_path))
     assert found["exponent"] == pytest.approx(2.5, abs=0.3)
     assert found["places"] == 6
     assert found["white_sigma_db"] is None
 
 
 def test_fuzzy_tells_the_speed_at_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = told(capsys, "fuzzy", "--at", 2.0, 0.0, "--at", 0.05, 2.0, "--figure", tmp_path / "b.png")
+    found = reported(capsys, "fuzzy", "--at", 2.0, 0.0, "--at", 0.05, 2.0, "--figure", tmp_path / "b.png")
     assert [point["speed_m_s"] for point in found["points"]] == [0.15, 0.05]
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
 
@@ -158,7 +158,7 @@ def places(folder: Path) -> Path:
 
 def test_fix_finds_places_and_exchanged_beacons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = places(tmp_path)
-    found = told(capsys, "fix", file, *CORNERS, "--fingerprints", file)
+    found = reported(capsys, "fix", file, *CORNERS, "--fingerprints", file)
     assert found["leave_one_out"] is True
     assert found["mean_error_m"] < 0.15
     other = tmp_path / "other.csv"
@@ -166,7 +166,7 @@ def test_fix_finds_places_and_exchanged_beacons(tmp_path: Path, capsys: pytest.C
     status, out, err = said(capsys, "radio", "fix", other, *CORNERS, "--fingerprints", file)
     assert status == 0
     assert "beacons look exchanged: B is C, C is B" in err
-    exchanged = told(capsys, "fix", other, *CORNERS, "--fingerprints", file, "--exchange", "B,C")
+    exchanged = reported(capsys, "fix", other, *CORNERS, "--fingerprints", file, "--exchange", "B,C")
     assert exchanged["mean_error_m"] < 0.15
     assert "mean error" in out
 
@@ -175,8 +175,8 @@ def test_fix_finds_places_and_exchanged_beacons(tmp_path: Path, capsys: pytest.C
 def test_xbee_scenario_1_is_fixed_within_its_limit(capsys: pytest.CaptureFixture[str]) -> None:
     folder = XBEE / "Scenario1"
     common = (*CORNERS, "--fingerprints", folder / "Database_Scenario1.xlsx")
-    tests = told(capsys, "fix", folder / "Tests_Scenario1.xlsx", "--exchange", "B,C", *common)
-    own = told(capsys, "fix", folder / "Database_Scenario1.xlsx", *common)
+    tests = reported(capsys, "fix", folder / "Tests_Scenario1.xlsx", "--exchange", "B,C", *common)
+    own = reported(capsys, "fix", folder / "Database_Scenario1.xlsx", *common)
     assert tests["mean_error_m"] <= 1.3
     assert own["mean_error_m"] <= 1.3
     inside = (tests["in_region"] + own["in_region"]) / (len(tests["points"]) + len(own["points"]))
@@ -186,9 +186,9 @@ def test_xbee_scenario_1_is_fixed_within_its_limit(capsys: pytest.CaptureFixture
 @needs_xbee
 def test_xbee_sheets_and_logs_agree(capsys: pytest.CaptureFixture[str]) -> None:
     sheet = XBEE / "Scenario1" / "Pathloss_Scenario1.xlsx"
-    one = told(capsys, "calibrate", sheet)
+    one = reported(capsys, "calibrate", sheet)
     logs = XBEE / "Scenario1" / "Pathloss" / "Zigbee"
-    other = told(capsys, "calibrate", logs, "--points", sheet)
+    other = reported(capsys, "calibrate", logs, "--points", sheet)
     assert other["readings"] == 900
     assert other["exponent"] == pytest.approx(one["exponent"], abs=0.05)
     assert other["shadowing_sigma_db"] > 5.0 * other["white_sigma_db"]
@@ -221,9 +221,9 @@ def test_what_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
     pytest.importorskip("gtsam", reason="the extra peers is not installed")
     run = recorded(world(seconds=20.0))
     nothing = np.full(len(run.readings.times_s), np.nan)
-    heard = replace(run, readings=run.readings._replace(range_m=nothing, rssi_dbm=nothing - 50.0))
+    received = replace(run, readings=run.readings._replace(range_m=nothing, rssi_dbm=nothing - 50.0))
     with pytest.raises(PeerGaveUp, match="no factor of signal strengths"):
-        run_gtsam(heard, SETTINGS, no_clock)
+        run_gtsam(received, SETTINGS, no_clock)
     with pytest.raises(PeerGaveUp, match=r"^simulated: GTSAM gave up: .*$"):
         run_gtsam(replace(run, first_pose=(np.nan, 0.0, 0.0)), SETTINGS, no_clock)
     monkeypatch.setitem(sys.modules, "gtsam", None)

@@ -51,7 +51,7 @@ def test_the_directions_of_the_frame_stand_apart(capsys: pytest.CaptureFixture[s
     assert "beyond the frame   0\n  other maps" in out
 
 
-def test_few_pairs_are_told_before_they_are_estimated(capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_few_pairs_are_reported_before_the_estimation(capsys: pytest.CaptureFixture[str]) -> None:
     programme = ("--set", "cricket.phase2.pairs=zigzag", "--set", "cricket.phase2.max_updates=40")
     data = mapped(capsys, "--method", "ekf", "--seeds", "3", *programme)
     assert data["rank_deficiency"] == 4
@@ -217,7 +217,7 @@ def test_a_wrong_range_is_named_and_blames_nothing_else(places: FloatArray, more
     assert data["expected_rms_m"] < 0.01
 
 
-def test_a_common_offset_is_still_told(tell: Any) -> None:
+def test_a_common_offset_is_still_reported(tell: Any) -> None:
     data = tell(FLAT, long=dict.fromkeys(range(28), 0.3) | {3: 2.3})
     assert any(warning.startswith("all ranges look 299 mm long") for warning in data["warnings"])
     assert data["expected_rms_m"] is None

@@ -263,7 +263,7 @@ FILES = sorted(FOLDER.glob("*.toml"))
 
 @pytest.mark.fault("P20")
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_the_fault_is_told_in_one_line(file: Path) -> None:
+def test_the_fault_is_reported_in_one_line(file: Path) -> None:
     assert len(FILES) > 50
     expected = file.read_text().splitlines()[0].removeprefix("# fault: ").replace("<folder>", str(FOLDER))
     with pytest.raises(ConfigError) as caught:
@@ -339,7 +339,7 @@ def test_values_are_set_and_all_else_stays(text: str, values: dict[str, float], 
     assert with_values(after, values, FILE) == after
 
 
-def test_what_is_no_toml_or_no_section_is_told() -> None:
+def test_what_is_no_toml_or_no_section_is_reported() -> None:
     with pytest.raises(ConfigError, match=r"x\.toml: is not TOML"):
         with_values("[robot", {"robot.a": 1.0}, FILE)
     with pytest.raises(ConfigError, match=r"x\.toml: robot is a value, not a section"):

@@ -187,7 +187,7 @@ def test_standing_over_a_gap_is_no_edge_however_long(at_seam: Story) -> None:
 # -- (c) no map -------------------------------------------------------------------------------------------------------
 
 
-def test_without_an_estimate_a_seam_is_not_believed_and_nothing_is_permitted(at_seam: Story) -> None:
+def test_without_an_estimate_no_seam_is_assumed_and_nothing_is_permitted(at_seam: Story) -> None:
     at_seam.has_estimate = False
     verdict = at_seam.run(6, v=0.1, off=FRONT)
     assert verdict.code is EventCode.NEAR_EDGE
@@ -396,7 +396,7 @@ def test_the_age_of_an_estimate(on_panel: Story, age_s: float, expected: tuple[b
     assert verdict.cause == ("" if expected[0] else "estimate stale")
 
 
-def test_every_value_is_finite_before_anything_is_heard(on_panel: Story) -> None:
+def test_every_value_is_finite_before_the_first_reception(on_panel: Story) -> None:
     edge = [EdgeSample(1e-3 * k, 0, 0, 0, 1) for k in range(1, 4)]
     verdict = on_panel.monitor.step(frame_of(1, 0.003, [], edge), None)
     assert verdict.cause == f"{OFF_WITHOUT_WHEELS.message}; encoder samples stale"

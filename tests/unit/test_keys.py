@@ -317,7 +317,7 @@ def test_commands_and_typed_answers(runtime_dir: Path) -> None:
     assert [request["cmd"] for request in asked] == ["status", "pause", "resume", "abort", "stop"]
 
 
-def test_an_answer_of_another_shape_is_told(runtime_dir: Path) -> None:
+def test_an_answer_of_another_shape_is_reported(runtime_dir: Path) -> None:
     with (
         serving(runtime_dir, "control", lambda _: {"ok": True, "status": {"state": 7}}),
         pytest.raises(DaemonUnreachableError, match="not what was asked for"),
@@ -360,14 +360,14 @@ def test_observatory(runtime_dir: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("body", "told"), [(b'{"status": "error", "message": "nothing is paused"}', "nothing is paused"), (b"no", "no")]
+    ("body", "reported"), [(b'{"status": "error", "message": "nothing is paused"}', "nothing is paused"), (b"no", "no")]
 )
-def test_a_refusal_of_the_page_says_why(body: bytes, told: str) -> None:
+def test_a_refusal_of_the_page_says_why(body: bytes, reported: str) -> None:
     with answering(lambda method, *_: (409 if method == "POST" else 503, body)) as url:
         client = HttpClient(url)
         assert not client.is_healthy()
         for order in (client.pause, client.resume, client.abort, client.stop):
-            with pytest.raises(RefusedError, match=rf"{order.__name__} refused \(409\): {told}"):
+            with pytest.raises(RefusedError, match=rf"{order.__name__} refused \(409\): {reported}"):
                 order()
 
 
@@ -376,9 +376,9 @@ def test_no_page_there(free_port: int) -> None:
         HttpClient(f"http://127.0.0.1:{free_port}").status()
 
 
-@pytest.mark.parametrize(("body", "told"), [(b"<html>", "is no JSON"), (b"[]", "is no object")])
-def test_another_server_is_told(body: bytes, told: str) -> None:
-    with answering(lambda *_: (200, body)) as url, pytest.raises(DaemonUnreachableError, match=told):
+@pytest.mark.parametrize(("body", "reported"), [(b"<html>", "is no JSON"), (b"[]", "is no object")])
+def test_another_server_is_reported(body: bytes, reported: str) -> None:
+    with answering(lambda *_: (200, body)) as url, pytest.raises(DaemonUnreachableError, match=reported):
         HttpClient(url).status()
 
 

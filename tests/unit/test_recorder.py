@@ -197,7 +197,7 @@ def test_slow_topics_reach_the_file_without_a_full_chunk(path: Path) -> None:
     slow.close()
 
 
-def test_messages_that_cannot_be_recorded_are_left_out(path: Path) -> None:
+def test_messages_that_cannot_be_recorded_are_not_used(path: Path) -> None:
     made = Recorder(path, TOPICS, is_simulation=True, on_failure=pytest.fail)
     made.write("unknown", 1.0, b"{}")
     for t_s in (float("nan"), float("inf"), -1.0):
@@ -278,15 +278,15 @@ def test_facts_of_a_recording_in_order(recorded: Path) -> None:
     assert facts.condition.is_complete
     assert facts.faults == []
     assert facts.condition.lost == []
-    told = facts.as_json()
-    assert told["verified"]
-    assert told["messages"] == 600
-    assert (told["start_s"], told["end_s"]) == (0.0, 5.99)
-    assert told["utc"] == ["2027-01-15T12:00:00Z", "2027-01-15T12:00:05Z"]
-    assert told["metadata"] == {"ccatp": {"mirror": "fyst-m1", "simulation": "true"}}
-    assert told["topics"]["track"]["schema"] == "x.Track"
-    assert told["topics"]["fix"]["messages"] == 0
-    assert told["bytes_per_hour"] == pytest.approx(recorded.stat().st_size * 3600 / 5.99, abs=1)
+    reported = facts.as_json()
+    assert reported["verified"]
+    assert reported["messages"] == 600
+    assert (reported["start_s"], reported["end_s"]) == (0.0, 5.99)
+    assert reported["utc"] == ["2027-01-15T12:00:00Z", "2027-01-15T12:00:05Z"]
+    assert reported["metadata"] == {"ccatp": {"mirror": "fyst-m1", "simulation": "true"}}
+    assert reported["topics"]["track"]["schema"] == "x.Track"
+    assert reported["topics"]["fix"]["messages"] == 0
+    assert reported["bytes_per_hour"] == pytest.approx(recorded.stat().st_size * 3600 / 5.99, abs=1)
 
 
 def test_a_recording_cut_off_anywhere_gives_what_was_whole_and_is_saved(recorded: Path, tmp_path: Path) -> None:
@@ -386,8 +386,8 @@ def test_a_disk_that_garbles_is_noticed(recorded: Path, tmp_path: Path, monkeypa
 
 
 def test_commands(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (told,) = answered(capsys, "recording", "info", tmp_path)["recordings"]
-    assert told["complete"]
+    (reported,) = answered(capsys, "recording", "info", tmp_path)["recordings"]
+    assert reported["complete"]
     text = printed(capsys, "recording", "info", recorded)
     assert "complete, every checksum right" in text
     assert "0.00 to 5.99 s of the robot's clock, 2027-01-15T12:00:00Z to 2027-01-15T12:00:05Z, " in text
@@ -424,17 +424,17 @@ def test_a_recording_that_is_being_written_is_not_damaged(tmp_path: Path, capsys
     for n in range(600):
         made.write("track", n / 100, payload(n))
     with locked(run_dir / RUN_LOCK, "taken"):
-        told = printed(capsys, "recording", "info", run_dir)
-        assert "telemetry.mcap: still being written, so without an index\n" in told
-        assert "recording repair" not in told
-        assert "beacon_map" not in told
-        assert "  1 topic without messages\n" in told
+        reported = printed(capsys, "recording", "info", run_dir)
+        assert "telemetry.mcap: still being written, so without an index\n" in reported
+        assert "recording repair" not in reported
+        assert "beacon_map" not in reported
+        assert "  1 topic without messages\n" in reported
         assert damage_text(run_dir / "telemetry.mcap", "x").startswith("telemetry.mcap: still being written")
     # Nobody writes it any more, and it has no end.
-    told = printed(capsys, "recording", "info", run_dir, status=1)
-    assert "telemetry.mcap: cut off or damaged\n" in told
-    assert "  no index: it was not closed\n" in told
-    assert "RecordLengthLimitExceeded" not in told
-    assert "recording repair" in told
+    reported = printed(capsys, "recording", "info", run_dir, status=1)
+    assert "telemetry.mcap: cut off or damaged\n" in reported
+    assert "  no index: it was not closed\n" in reported
+    assert "RecordLengthLimitExceeded" not in reported
+    assert "recording repair" in reported
     made.close()
     assert main(["recording", "info", str(run_dir)]) == 0

@@ -174,7 +174,7 @@ async def test_a_robot_that_talks_nonsense_is_left(flood: bytes, reason: str) ->
         assert seen.frames == [0]
 
 
-async def test_a_lost_connection_is_told_once() -> None:
+async def test_a_lost_connection_is_reported_once() -> None:
     async def hang_up(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.close()
 
@@ -349,7 +349,7 @@ async def test_commands_do_not_pile_up() -> None:
         resume.set()
 
 
-def test_a_line_is_sent_before_the_event_loop_goes_on() -> None:
+def test_a_line_is_sent_before_the_event_loop_continues() -> None:
     async def send() -> None:
         ours, theirs = socket.socketpair()
         with theirs:

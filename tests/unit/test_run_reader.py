@@ -114,7 +114,7 @@ def test_missing_frames_are_counted(tmp_path: Path, config_text: str) -> None:
     assert recording.warnings == [f"{recording.path}: 5 frames are missing in between"]
 
 
-def test_what_cannot_be_read_is_left_out_and_told_once(tmp_path: Path, config_text: str) -> None:
+def test_what_cannot_be_read_is_not_used_and_reported_once(tmp_path: Path, config_text: str) -> None:
     bad = SensorLines(seq=1, t_s=0.01, lines=[msgspec.Raw(b'{"type":"sensors"}')])
     record(tmp_path, [("sensors", batch(0)), ("sensors", bad), ("sensors", bad)], config=config_text)
     (recording,) = open_run(tmp_path)
@@ -272,7 +272,7 @@ def test_overrides_act(survey_dir: Path) -> None:
         read_run(survey_dir, {"robot.puck_height_m": "high"})
 
 
-def test_a_run_that_goes_on_is_read_beside_its_writer(survey_dir: Path) -> None:
+def test_a_run_that_continues_is_read_beside_its_writer(survey_dir: Path) -> None:
     with closing(sqlite3.connect(survey_dir / "mission.sqlite", isolation_level=None)) as writer:
         writer.execute("BEGIN IMMEDIATE")
         writer.execute("DELETE FROM events")
@@ -297,7 +297,7 @@ def test_a_run_that_was_killed_in_a_commit_is_read(survey_dir: Path, tmp_path: P
     assert (killed / "mission.sqlite").read_bytes() == before
 
 
-def test_a_damaged_fix_is_left_out(survey_dir: Path) -> None:
+def test_a_damaged_fix_is_not_used(survey_dir: Path) -> None:
     with closing(sqlite3.connect(survey_dir / "mission.sqlite")) as db:
         db.execute("UPDATE fixes SET x_m = x_m + 1 WHERE point = 2")
         db.commit()
@@ -356,7 +356,7 @@ def test_a_resumed_run_has_the_truth_of_its_sessions_where_it_is_one(survey_dir:
     )
 
 
-def test_a_recording_that_cannot_be_read_is_told(survey_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_that_cannot_be_read_is_reported(survey_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(path: Path) -> dict[str, str]:
         raise PermissionError(13, "Permission denied")
 
@@ -376,8 +376,8 @@ def test_a_path_is_exported_as_a_trajectory(
     messages: list[tuple[str, Message]] = [("sensors", batch(0, 1)), ("track", track(0, 1))]
     record(run, [*messages, ("truth", TruthMessage(seq=0, t_s=0.0, rows=rows))], config=config_text, simulation="true")
     (run / "config.toml").write_text(config_text, encoding="utf-8")
-    told = printed(capsys, "recording", "export", run, "--tum", estimates, "--truth", truth)
-    assert told == f"{estimates}: 2 poses\n{truth}: 1 poses\n"
+    reported = printed(capsys, "recording", "export", run, "--tum", estimates, "--truth", truth)
+    assert reported == f"{estimates}: 2 poses\n{truth}: 1 poses\n"
     t_s, *place, qx, qy, qz, qw = map(float, truth.read_text().split())
     assert (t_s, place, qx, qy) == (0.0, [1.0, 2.0, 3.0], 0.0, 0.0)
     assert (qz, qw) == pytest.approx((sin(0.25), cos(0.25)), abs=1e-9)

@@ -147,7 +147,7 @@ def test_the_queue_is_bounded_and_drops_arrivals(path: Path, monkeypatch: pytest
     assert select(path, "SELECT t_s FROM arrivals") == [(0.0,), (1.0,), (2.0,)]
 
 
-def test_a_cancelled_request_is_left_out(path: Path) -> None:
+def test_a_cancelled_request_is_not_executed(path: Path) -> None:
     with make(path) as db:
         gate = hold(db)
         late = db.record_fix(PANEL[0], a_fix(), POSE)
@@ -443,7 +443,9 @@ def test_a_record_of_before_is_refused(tmp_path: Path) -> None:
         read_checkpoint(path, Place)
 
 
-def test_a_disk_that_refuses_is_told_and_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_refuses_is_reported_and_the_mission_is_unaffected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: object) -> int:
         raise OSError(28, "No space left on device")
 

@@ -341,7 +341,7 @@ def test_a_late_subscriber_gets_what_is_latched(
                 assert peer.recv_multipart()[0] == b"view/panels"
 
 
-def test_a_port_that_is_taken_is_told(context: zmq.Context[zmq.Socket[bytes]]) -> None:
+def test_a_port_that_is_taken_is_reported(context: zmq.Context[zmq.Socket[bytes]]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -404,7 +404,7 @@ async def test_foxglove_gets_channels_schemas_and_messages(foxglove: FoxgloveStr
     assert found == {7: (0, PANELS.payload), 8: (1_250_000_000, ROBOT.payload)}
 
 
-def test_a_network_is_served_only_when_told_to() -> None:
+def test_a_network_is_served_only_when_configured() -> None:
     check_host("127.0.0.1", is_open=False)
     check_host("localhost", is_open=False)
     check_host("0.0.0.0", is_open=True)

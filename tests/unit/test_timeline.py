@@ -96,7 +96,7 @@ def test_without_a_step_the_axis_is_the_robots_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("has_sessions", [True, False])
-def test_after_a_restart_numbers_and_times_go_on(tmp_path: Path, has_sessions: bool) -> None:
+def test_after_a_restart_numbers_and_times_continue(tmp_path: Path, has_sessions: bool) -> None:
     begin, again = ([session(7, 3)], [session(8, 1, 49)]) if has_sessions else ([], [])
     found = axis(tmp_path, *begin, track(FIRST), lines(FIRST), *again, track(SECOND, 49), lines(SECOND))
     assert found.number.tolist() == [*range(89)]
@@ -228,7 +228,7 @@ def test_a_sample_from_before_a_step_has_the_time_of_before_it(tmp_path: Path) -
     assert found.sample_s(300, 3.0, 3.01) is None  # after its frame
 
 
-def test_a_truth_that_cannot_be_joined_is_left_out(tmp_path: Path) -> None:
+def test_a_truth_that_cannot_be_joined_is_not_used(tmp_path: Path) -> None:
     """Main was down when the robot restarted, so nobody counted the frames between."""
     first, second = lines(range(30)), lines(SECOND)
     found = on_axis(tmp_path / "old", first, second, truth(range(90)))[-1]

@@ -375,7 +375,7 @@ def test_points_whose_lengths_contradict_each_other_do_not_move_a_panel() -> Non
     assert fit_panels(M1, [unreliable(one) for one in measured], HEIGHT_M) == {}
 
 
-def test_contradictions_beyond_outliers_are_told() -> None:
+def test_contradictions_beyond_outliers_are_reported() -> None:
     rng = np.random.default_rng(4)
     measured = [shifted(one, float(rng.normal()) * 60e-6) for one in exact()]
     result = result_of(measured)
@@ -414,7 +414,7 @@ def test_a_fix_that_is_none_does_not_stop_the_others() -> None:
     assert result.undetermined[1].why == "a fix claims to be exact: its covariance is not positive"
 
 
-def test_a_mirror_without_light_is_told() -> None:
+def test_a_mirror_without_light_is_reported() -> None:
     result = result_of(exact(), CFG.align.model_copy(update={"light": {}}))
     assert result.warnings == (
         "no light is configured for fyst-m1 (align.light): its angle of incidence is taken as 0",
@@ -491,7 +491,7 @@ def test_the_table_tells_the_same(run_dir: Path, capsys: pytest.CaptureFixture[s
     assert err == "ccatp: warning: panel 3/7: not used, because they are outliers: 3/7/6; measure them again\n"
 
 
-def test_a_survey_without_a_panel_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_survey_without_a_panel_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_dir = make_run(tmp_path / "run", CFG, M1.point_ids(ALIGNED), [], None)
     found = aligned(capsys, run_dir)
     assert (found["panels"], found["rms_before_um"], found["rms_after_um"]) == ([], None, None)

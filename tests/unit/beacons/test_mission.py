@@ -84,7 +84,7 @@ def test_stop_ends_it_where_it_is_and_then_it_takes_no_commands(stage: BeaconSil
         assert stage.mission.handle(event) == over
 
 
-def test_what_holds_the_robot_says_when_it_goes_on() -> None:
+def test_what_holds_the_robot_says_when_it_continues() -> None:
     frame = BeaconMeasurements(0.0, (), BeaconFrame())
 
     def after(state: HoldState, verdict: Verdict | None, *, goes_on: bool) -> HoldState:
@@ -295,7 +295,7 @@ def test_the_store_keeps_what_was_reached(cfg: RadioConfig, tmp_path: Path) -> N
         BeaconStore(tmp_path / "nowhere" / "mission.sqlite", {}, (), 0)
 
 
-def test_pulses_of_unknown_motes_are_left_out() -> None:
+def test_pulses_of_unknown_motes_are_not_used() -> None:
     own = SelfMap(radio_config_of("cricket").cricket)
     own.take(MoteBurst(0.0, "stranger", "N1-1", 20.0, [0.01]))
     own.take(MoteBurst(0.0, "N1-1", "robot", 20.0, [0.01]))
@@ -309,7 +309,7 @@ COMING = {"type": "target_approach", "at_s": 30.0, "for_s": 6.0, "speed_m_s": 0.
 FASTER = {**COMING, "for_s": 8.0, "speed_m_s": 0.12}
 
 
-def test_silence_of_all_radios_holds_the_robot_until_they_are_heard_again() -> None:
+def test_silence_of_all_radios_holds_the_robot_until_they_are_received_again() -> None:
     cfg = radio_config_of("zigbee", sim__incidents=[SILENCE])
     found = play(BeaconSilWorld(cfg)).result()
     held = [t_s for t_s, state in zip(found.times_s, found.states, strict=True) if state == "held"]

@@ -226,8 +226,8 @@ def test_the_command_writes_what_it_found(
     assert "nothing written" in shown.err
     assert config.read_text() == text
     result = answered(capsys, *command)
-    told = result["parameters"]["robot.wheel_radius_m"]
-    assert told["found"] == pytest.approx(found.radius.value, abs=1e-9)  # of a few decimals of the recorded samples
+    reported = result["parameters"]["robot.wheel_radius_m"]
+    assert reported["found"] == pytest.approx(found.radius.value, abs=1e-9)  # of a few decimals of the recorded samples
     assert result["written"] == str(config)
     written = config.read_text()
     assert f"wheel_radius_m = {round(found.radius.value, 8)}  # by a tape" in written
@@ -253,8 +253,8 @@ def test_what_is_replaced_is_shown_and_nothing_without_a_configuration(
 
 
 def test_misuse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = "name the robot's configuration with --config FILE, or add --sim"
-    assert told in refused(capsys, "calibrate")
+    reported = "name the robot's configuration with --config FILE, or add --sim"
+    assert reported in refused(capsys, "calibrate")
     assert "no telemetry.mcap there" in refused(capsys, "calibrate", "--from", tmp_path)
 
 

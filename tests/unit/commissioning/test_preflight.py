@@ -131,7 +131,7 @@ def gravity(*signs: float) -> Change:
 
 
 @pytest.mark.parametrize(
-    ("change", "name", "outcome", "told"),
+    ("change", "name", "outcome", "reported"),
     [
         (every(faults=["fan_left"]), "faults", FAIL, "reports fan_left"),
         (every(enc=[]), "encoders", FAIL, "right: wheel encoders deliver no samples"),
@@ -154,14 +154,14 @@ def gravity(*signs: float) -> Change:
         (every(soc=0.5), "battery", WARN, "50%, for 36 min"),
     ],
 )
-def test_what_is_wrong_is_found(change: Change, name: str, outcome: CheckOutcome, told: str) -> None:
+def test_what_is_wrong_is_found(change: Change, name: str, outcome: CheckOutcome, reported: str) -> None:
     report = stood()
     frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in report.frames]
     for frame in frames:
         change(frame)
     (wrong,) = [finding for finding in check_robot(report._replace(frames=frames)) if finding.outcome is not PASS]
     assert (wrong.name, wrong.outcome) == (name, outcome)
-    assert told in wrong.found
+    assert reported in wrong.found
     assert wrong.todo
 
 
@@ -171,7 +171,7 @@ def other_robot(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("change", "name", "outcome", "told"),
+    ("change", "name", "outcome", "reported"),
     [
         ({"arrived_s": [0.02 * k for k in range(FRAMES)]}, "frames", FAIL, "50.0 a second"),
         ({"arrived_s": [0.01 * k + 0.2 * (k > 100) for k in range(FRAMES)]}, "frames", FAIL, "longest gap 210 ms"),
@@ -182,13 +182,15 @@ def other_robot(**changes: Any) -> dict[str, Any]:
         (other_robot(lockstep=True), "robot clock", WARN, "simulated, in lockstep"),
     ],
 )
-def test_a_wrong_time_or_robot_is_found(change: dict[str, Any], name: str, outcome: CheckOutcome, told: str) -> None:
+def test_a_wrong_time_or_robot_is_found(
+    change: dict[str, Any], name: str, outcome: CheckOutcome, reported: str
+) -> None:
     found = by_name(check_robot(stood()._replace(**change)))
     assert found[name].outcome is outcome
-    assert told in found[name].found
+    assert reported in found[name].found
 
 
-def test_fans_below_the_floor_are_told() -> None:
+def test_fans_below_the_floor_are_reported() -> None:
     report = stood("fyst-m2")
     frames = [msgspec.structs.replace(frame, fans=(0.6, 0.3)) for frame in report.frames]
     assert "the robot would fall" in by_name(check_robot(report._replace(frames=frames)))["fans"].todo
@@ -322,14 +324,18 @@ def test_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_no_run_can_be_written_there(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for where, told in (("file", "is no directory"), ("file/runs", "no directory"), ("nowhere/runs", "no directory")):
+    for where, reported in (
+        ("file", "is no directory"),
+        ("file/runs", "no directory"),
+        ("nowhere/runs", "no directory"),
+    ):
         found = machine(tmp_path, where)
         assert found["disk"].outcome is FAIL
-        assert told in found["disk"].found
+        assert reported in found["disk"].found
         assert "disk space" not in found
 
 
-def test_a_daemon_that_runs_is_told(tmp_path: Path) -> None:
+def test_a_daemon_that_runs_is_reported(tmp_path: Path) -> None:
     (tmp_path / "rt").mkdir(mode=0o700)
     with (tmp_path / "rt" / "lock").open("w") as file:
         flock(file, LOCK_EX)

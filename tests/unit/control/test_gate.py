@@ -191,23 +191,23 @@ def test_value_and_rate_are_limited(wanted: list[tuple[float, float]]) -> None:
         last = now
 
 
-def test_denials_are_told_once_a_second_and_counted() -> None:
-    under_test, told = gate(), []
-    watch = GateLog(under_test, lambda level, text: told.append((level, text)))
+def test_denials_are_reported_once_a_second_and_counted() -> None:
+    under_test, reported = gate(), []
+    watch = GateLog(under_test, lambda level, text: reported.append((level, text)))
     for k in range(250):
         drive(under_test, SLOW, None)
         watch.update(0.01 * k)
-    assert [level for level, _ in told] == ["warning"] * 3
-    assert told[1][1] == "drive denied: there is no verdict (101 so far)"
+    assert [level for level, _ in reported] == ["warning"] * 3
+    assert reported[1][1] == "drive denied: there is no verdict (101 so far)"
     drive(under_test, SLOW, purpose=Purpose.STAND)
     watch.update(2.5)
-    assert "state allows no motion" in told[3][1]
+    assert "state allows no motion" in reported[3][1]
     drive(under_test, SLOW, None)
     watch.update(0.0)  # the robot's clock began anew
-    assert len(told) == 5
+    assert len(reported) == 5
     drive(under_test, SLOW)
     watch.update(9.0)
-    assert len(told) == 5
+    assert len(reported) == 5
     assert watch.counts == {"no_verdict": 251, "state": 1}
 
 

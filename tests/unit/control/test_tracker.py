@@ -306,7 +306,7 @@ def test_the_crab_angle_keeps_a_drifting_robot_on_its_line(config: Config) -> No
     assert rig.heading == pytest.approx(-0.05, abs=2e-3)  # asin(0.05), and what steering moved it
 
 
-def test_a_drive_that_cannot_end_stops_in_time_near_the_stop_and_goes_on_far_from_it(config: Config) -> None:
+def test_a_drive_that_cannot_end_stops_in_time_near_the_stop_and_continues_far_from_it(config: Config) -> None:
     budget_s = bang_bang_time(0.3, 0.1, 0.2) + config.control.stop_time_s
     for left_over_m, is_ended in ((0.002, True), (0.05, False)):
         tracker = Leg(LegTracker(config.control, config.limits, 0.08))

@@ -174,13 +174,13 @@ Log = structlog.typing.FilteringBoundLogger
 
 
 @pytest.fixture
-def told() -> StringIO:
+def reported() -> StringIO:
     return StringIO()
 
 
 @pytest.fixture
-def log(told: StringIO) -> Log:
-    logger: Log = structlog.wrap_logger(structlog.PrintLogger(told))
+def log(reported: StringIO) -> Log:
+    logger: Log = structlog.wrap_logger(structlog.PrintLogger(reported))
     return logger
 
 
@@ -203,13 +203,15 @@ def test_an_emergency_is_there_after_a_restart_until_it_is_cleared(tmp_path: Pat
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"active": [{"id": "a"}], "cleared": []}', '{"active": 3}'])
-def test_a_file_that_cannot_be_read_counts_as_an_emergency(tmp_path: Path, log: Log, told: StringIO, text: str) -> None:
+def test_a_file_that_cannot_be_read_counts_as_an_emergency(
+    tmp_path: Path, log: Log, reported: StringIO, text: str
+) -> None:
     (tmp_path / FILE).write_text(text)
     latch = PersistentEmergencyLatch(tmp_path / FILE, log)
     assert latch.is_latched
     newest = latch.newest
     assert newest is not None
-    assert f"'ccatp clear {UUID(newest.id)}' ends it" in told.getvalue()
+    assert f"'ccatp clear {UUID(newest.id)}' ends it" in reported.getvalue()
     again = PersistentEmergencyLatch(tmp_path / FILE, log)
     assert again.newest == newest  # the same after a restart
     assert again.clear(newest.id, at_base_or_held=True) is None
@@ -221,13 +223,13 @@ def no_room(*_: int) -> None:
 
 
 def test_a_disk_that_refuses_does_not_keep_an_emergency_from_being_latched(
-    tmp_path: Path, log: Log, told: StringIO, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, log: Log, reported: StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     latch = PersistentEmergencyLatch(tmp_path / FILE, log)
     monkeypatch.setattr("os.fsync", no_room)
     assert latch.raise_emergency("fire", "a") is None
     assert latch.is_latched
-    assert "emergencies_not_saved" in told.getvalue()
+    assert "emergencies_not_saved" in reported.getvalue()
 
 
 @pytest.mark.fault("P13")

@@ -163,7 +163,7 @@ def test_an_earthquake_is_kept_by_the_danger_loop(driving: Story) -> None:
     assert driving.mission.state.is_paused
 
 
-def test_what_was_stopped_on_its_way_home_goes_home_when_it_goes_on(driving: Story) -> None:
+def test_what_was_stopped_on_its_way_home_goes_home_when_it_continues(driving: Story) -> None:
     assert driving.mission.handle(Abort("operator")) is None
     assert driving.mission.handle(StopHere()) is None
     after = taken_over(driving, is_new_run=True)
@@ -264,7 +264,7 @@ def test_a_point_is_retried_once_however_often_main_is_killed(config: Config, se
 # -- in files ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_survey_goes_on_from_its_directory(tmp_path: Path) -> None:
+def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     where = args(load_config(None, {"run.panels": 1}), tmp_path)
     built, store = build(where)
     one, two, three, *_ = (stop.point for stop in built.route.stops if stop.point is not None)
@@ -325,9 +325,7 @@ def test_files_of_another_run_are_refused(tmp_path: Path, measured: Measured) ->
     measured("P24", 0)
 
 
-def test_it_is_written_ten_times_a_second_at_once_in_a_hold_or_abort_and_never_without_a_place(
-    driving: Story, tmp_path: Path
-) -> None:
+def test_the_checkpoint_is_due_ten_times_a_second_and_at_each_hold_or_abort(driving: Story, tmp_path: Path) -> None:
     localizer = SimpleNamespace(
         deck_pose=DeckPose(1.0, 2.0, 0.5), position_sigma_m=1e-4, heading_sigma_rad=1e-3, speed_m_s=0.1, rate_rad_s=0.2
     )

@@ -40,7 +40,7 @@ def surveys_of(runtime_dir: Path, program: str = "") -> SurveyTask:
 
 
 @pytest.mark.parametrize(
-    ("program", "panels", "code", "success", "told"),
+    ("program", "panels", "code", "success", "reported"),
     [
         ("0", None, 0, True, "complete"),
         ("3", None, 3, False, "at base"),
@@ -51,16 +51,16 @@ def surveys_of(runtime_dir: Path, program: str = "") -> SurveyTask:
     ],
 )
 def test_a_survey_ends_as_its_process_does(
-    program: str, panels: int | None, code: int, success: bool, told: str, runtime_dir: Path
+    program: str, panels: int | None, code: int, success: bool, reported: str, runtime_dir: Path
 ) -> None:
     session = Session()
     done, text = surveys_of(runtime_dir, f"import sys; raise SystemExit({program})").survey(session, panels)
     assert done is success
-    assert told in text
+    assert reported in text
     assert session.data["exit_status"] == code
 
 
-def test_a_survey_that_says_nothing_is_ended(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_survey_that_reports_nothing_is_ended(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccatp.daemon.ocs_agent.START_TIMEOUT_S", 0.2)
     done, text = surveys_of(runtime_dir, "import time; time.sleep(60)").survey(Session())
     assert not done
@@ -150,7 +150,7 @@ def test_the_command_of_a_survey() -> None:
     assert survey_command(args)[3:] == ["run", "--sim", "--realtime", "--config", "a.toml", "--mirror", "fyst-m2"]
 
 
-def test_without_the_extra_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_it_reports_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ocs", None)
     with pytest.raises(ConfigError, match=r"install ccatp with its extra, ccatp\[ocs\]"):
         main([])

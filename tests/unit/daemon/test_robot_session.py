@@ -163,7 +163,7 @@ async def test_a_robot_that_stays_away_ends_it() -> None:
     await with_robot(story)
 
 
-async def test_a_role_that_is_taken_is_tried_again_by_who_takes_over_and_not_by_others() -> None:
+async def test_only_a_process_that_takes_over_tries_again_for_a_role_that_is_in_use() -> None:
     async def story(cfg: Config, robot: SurveyLoop) -> None:
         first, second = Client(cfg), Client(cfg)
         await first.join(is_patient=False)
@@ -284,7 +284,7 @@ async def measured_once(
     not_ready: int = 0,
 ) -> tuple[list[FixMessage], list[str]]:
     """One request, with a laser system that always answers: the fixes, and texts of warnings or levels of messages."""
-    told, levels, over = list[FixMessage](), list[str](), asyncio.Event()
+    reported, levels, over = list[FixMessage](), list[str](), asyncio.Event()
 
     async def measure(_t_s: float, _expected_m: Any) -> Fix:
         return Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0)
@@ -307,7 +307,7 @@ async def measured_once(
             fuse_fix=fuse_fix, notices=[], pose=None, pose_covariance=np.eye(3), position_sigma_m=5e-6
         ),
         on_finished=over.set,
-        publish=lambda _topic, message: told.append(message),
+        publish=lambda _topic, message: reported.append(message),
         notify=lambda level, text: levels.append(level if level != "warning" else text),
         not_ready=not_ready,
     )
@@ -316,18 +316,20 @@ async def measured_once(
     async with asyncio.timeout(10.0):
         await over.wait()
     serving.cancel()
-    return told, levels
+    return reported, levels
 
 
 @pytest.mark.parametrize(
     ("refusals", "are_fused"),
     [([], [True]), ([FixGated("far")], [False, True]), ([FixRefused("too old")] * 4, [False] * 3)],
 )
-async def test_every_fix_that_the_localizer_saw_is_told(
+async def test_every_fix_that_the_localizer_took_is_reported(
     refusals: list[Exception], are_fused: list[bool], config: Config
 ) -> None:
-    told, _ = await measured_once(config, refusals.copy(), None, None, lambda _event: None)
-    assert [(fix.point, fix.is_fused, fix.is_set_aside) for fix in told] == [(None, one, False) for one in are_fused]
+    reported, _ = await measured_once(config, refusals.copy(), None, None, lambda _event: None)
+    assert [(fix.point, fix.is_fused, fix.is_set_aside) for fix in reported] == [
+        (None, one, False) for one in are_fused
+    ]
 
 
 async def test_a_point_that_is_measured_already_is_done_and_needs_no_operator(config: Config) -> None:
@@ -335,8 +337,8 @@ async def test_a_point_that_is_measured_already_is_done_and_needs_no_operator(co
     refused: Future[None] = Future()
     refused.set_exception(AlreadyMeasuredError("point 1/2/4 has been measured; its fix is not replaced"))
     store = SimpleNamespace(record_fix=lambda *_: refused)
-    told, levels = await measured_once(config, [], store, POINT, events.append)
-    assert (events, levels, [fix.point for fix in told]) == (
+    reported, levels = await measured_once(config, [], store, POINT, events.append)
+    assert (events, levels, [fix.point for fix in reported]) == (
         [FixStored(POINT, 0.0)],
         ["point 1/2/4 has been measured; its fix is not replaced"],
         [(1, 2, 4)],
@@ -347,6 +349,6 @@ async def test_a_laser_that_is_not_ready_is_waited_for_and_reported_once(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ccatp.daemon.fix_service.LASER_PERIOD_S", 0.0)
-    told, levels = await measured_once(config, [], None, None, lambda _event: None, not_ready=3)
-    assert [fix.is_fused for fix in told] == [True]
+    reported, levels = await measured_once(config, [], None, None, lambda _event: None, not_ready=3)
+    assert [fix.is_fused for fix in reported] == [True]
     assert levels == [f"measurement of the robot's place waits: {LASER_NOT_READY.message}"]

@@ -210,7 +210,7 @@ def test_a_run_directory_is_named_by_time_mirror_and_seed(mirror: str) -> None:
         ("[]", False),
     ],
 )
-def test_a_mission_is_finished_when_its_summary_says_so(text: str, is_finished: bool, tmp_path: Path) -> None:
+def test_a_mission_is_finished_when_its_summary_reports_it(text: str, is_finished: bool, tmp_path: Path) -> None:
     assert finished_summary(tmp_path) is None
     (tmp_path / "summary.json").write_text(text)
     assert (finished_summary(tmp_path) is not None) is is_finished
@@ -226,7 +226,7 @@ def test_a_real_robot_keeps_the_walls_time(sim: bool, realtime: bool, is_paced: 
 # -- the run that did not finish --------------------------------------------------------------------------------------
 
 
-def test_a_service_goes_on_with_the_run_that_did_not_finish(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_continues_with_the_run_that_did_not_finish(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[RunOptions] = []
 
     def run_once(wanted: RunOptions, _cfg: Config) -> int:

@@ -37,12 +37,12 @@ class Manager:
         self.socket.setblocking(False)
 
     def heard(self) -> list[str]:
-        told = []
+        reported = []
         while True:
             try:
-                told.append(self.socket.recv(4096).decode())
+                reported.append(self.socket.recv(4096).decode())
             except BlockingIOError:
-                return told
+                return reported
 
 
 @pytest.fixture(params=["path", "abstract"])
@@ -71,7 +71,7 @@ def test_the_journal_is_known_by_its_descriptor(tmp_path: Path) -> None:
     assert not is_journal(-1, stream)
 
 
-def test_a_service_manager_that_is_gone_or_deaf_holds_nobody_up(tmp_path: Path) -> None:
+def test_a_service_manager_that_does_not_answer_delays_no_process(tmp_path: Path) -> None:
     Notifier("").send("READY=1")
     Notifier(str(tmp_path / "none")).send("READY=1")
     deaf = Manager(str(tmp_path / "notify"))
@@ -137,9 +137,9 @@ def test_a_service_from_its_start_to_its_end(manager: Manager) -> None:
     for tick in range(3, 33):
         both_alive(service, 0.1 * tick)
         service.update(0.1 * tick, NO_STATUS)
-    told = manager.heard()
-    assert told.count("WATCHDOG=1") == 6  # every half second
-    assert [line for line in told if line.startswith("STATUS")] == ["STATUS=, 0 of 0 points"]
+    reported = manager.heard()
+    assert reported.count("WATCHDOG=1") == 6  # every half second
+    assert [line for line in reported if line.startswith("STATUS")] == ["STATUS=, 0 of 0 points"]
     service.on_heartbeat(presence("main", 6.0))  # danger was last heard of at 3.2 s
     service.update(6.0, NO_STATUS)
     service.update(6.6, NO_STATUS)
@@ -152,19 +152,19 @@ def test_a_service_from_its_start_to_its_end(manager: Manager) -> None:
 
 
 @pytest.mark.parametrize(
-    ("watchdog_s", "told"),
+    ("watchdog_s", "reported"),
     [
         # Silence counts well before a short watchdog bites.
         (0.4, ["WATCHDOG=1", "STATUS=joined the robot", "STATUS=trouble: main sent its last heartbeat 0.3 s ago"]),
         (None, ["STATUS=joined the robot"]),
     ],
 )
-def test_a_short_watchdog_and_none(manager: Manager, watchdog_s: float | None, told: list[str]) -> None:
+def test_a_short_watchdog_and_none(manager: Manager, watchdog_s: float | None, reported: list[str]) -> None:
     service = Service(Notifier(manager.address), watchdog_s)
     both_alive(service, 0.0)
     for now_s in (0.0, 0.19, 0.3):
         service.update(now_s, None)
-    assert manager.heard() == ["READY=1", *told]
+    assert manager.heard() == ["READY=1", *reported]
 
 
 # -- real time --------------------------------------------------------------------------------------------------------

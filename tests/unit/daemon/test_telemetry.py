@@ -62,7 +62,7 @@ def test_stale_frames_alone_are_no_batch_of_estimates(telemetry: Telemetry, rece
     assert {name: len(messages) for name, messages in received.items()} == {"sensors": 1}
 
 
-def test_recorded_numbers_go_on_where_the_robot_begins_anew(telemetry: Telemetry) -> None:
+def test_recorded_numbers_continue_where_the_robot_begins_anew(telemetry: Telemetry) -> None:
     telemetry.continue_numbering()  # before any frame
     assert telemetry.frames_before == 0
     telemetry.add_frame(41, 1.0, b"{}", row(41))

@@ -39,9 +39,9 @@ def test_a_run_from_its_first_line_to_its_report(tmp_path: Path, capsys: pytest.
         view.show(message)
     view.show_summary({"mirror": "fyst-m1"}, as_json=True)
     view.show_report(str(tmp_path / "report.html"))
-    told = capsys.readouterr()
-    assert json.loads(told.out) == {"mirror": "fyst-m1"}
-    first, *lines, danger, report = told.err.splitlines()
+    reported = capsys.readouterr()
+    assert json.loads(reported.out) == {"mirror": "fyst-m1"}
+    first, *lines, danger, report = reported.err.splitlines()
     assert first == f"ccatp SIMULATION of fyst-m1, world thesis, seed 1, filter ekf; writing {folder}"
     assert lines == [
         "10 %: 1 of 10 points, driving, 1:01 elapsed, 0:09 remaining",
@@ -67,8 +67,8 @@ def test_quiet_and_verbose(
         view.show(message)
     view.show(replace(STATUS, state="held"))
     view.show_report("there")
-    told = capsys.readouterr().err.splitlines()
-    assert [line.partition(",")[0] for line in told if not line.startswith("ccatp SIM")] == lines
+    reported = capsys.readouterr().err.splitlines()
+    assert [line.partition(",")[0] for line in reported if not line.startswith("ccatp SIM")] == lines
 
 
 def test_danger_is_shown_where_it_holds_the_robot_without_a_code(
@@ -119,7 +119,7 @@ def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.Captur
         (MissionState.HELD, "", "held"),
     ],
 )
-def test_a_mission_that_goes_on_says_so(state: MissionState, cause: str, text: str) -> None:
+def test_a_mission_that_continues_reports_it(state: MissionState, cause: str, text: str) -> None:
     assert state_text(state, cause) == text
 
 
@@ -162,10 +162,10 @@ def test_kinds(one: str, other: str, is_same: bool) -> None:
     assert (kind_of(one) == kind_of(other)) is is_same
 
 
-def test_a_few_of_each_kind_are_told_and_errors_all() -> None:
+def test_a_few_of_each_kind_are_reported_and_errors_all() -> None:
     sparing = RateLimitedLog(2, 10.0)
-    told = [sparing.take("warning", f"held: {k} ms late", 0.1 * k) for k in range(50)]
-    assert told == ["held: 0 ms late", "held: 1 ms late", *[None] * 48]
+    reported = [sparing.take("warning", f"held: {k} ms late", 0.1 * k) for k in range(50)]
+    assert reported == ["held: 0 ms late", "held: 1 ms late", *[None] * 48]
     assert sparing.take("warning", "resumed: turning", 5.0) == "resumed: turning"
     assert sparing.take("info", "held: 9 ms late", 5.0) == "held: 9 ms late"
     assert sparing.take("warning", "held: 7 ms late", 10.5) == "held: 7 ms late (48 more times)"

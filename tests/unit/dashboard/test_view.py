@@ -52,7 +52,7 @@ MAIN, DANGER = "the main loop has not reported", "the danger loop has not report
 
 
 @pytest.mark.parametrize(
-    ("told", "picture_s", "now_s", "lost"),
+    ("reported", "picture_s", "now_s", "lost"),
     [
         pytest.param([presence("danger", 10.9)], None, 10.95, [], id="not yet"),
         pytest.param([presence("danger", 10.9)], None, 11.05, [MAIN], id="a loop that says nothing"),
@@ -71,8 +71,10 @@ MAIN, DANGER = "the main loop has not reported", "the danger loop has not report
         ),
     ],
 )  # fmt: skip
-def test_losses(links: Links, told: list[Heartbeat], picture_s: float | None, now_s: float, lost: list[str]) -> None:
-    for one in told:
+def test_losses(
+    links: Links, reported: list[Heartbeat], picture_s: float | None, now_s: float, lost: list[str]
+) -> None:
+    for one in reported:
         links.presence(one)
     links.picture_s = picture_s
     assert whats(links, now_s) == lost
@@ -100,7 +102,7 @@ def test_a_loop_that_is_gone_shows_at_once_and_until_another_one_speaks(links: L
     assert links.restarts == {"main": 1, "danger": 0}
 
 
-def test_what_is_new_is_told_once_and_the_older_half_gets_thin() -> None:
+def test_what_is_new_is_reported_once_and_the_older_half_gets_thin() -> None:
     grown = Growing(100)
     for k in range(2):
         grown.add(k, 1.0)
@@ -173,7 +175,7 @@ def test_a_line_that_comes_again_is_one_row_with_its_newest_text_and_old_ones_go
     assert lines.left_out == 301  # the 300 that were late, and the one that was killed
 
 
-def test_the_worst_of_each_second_is_told_when_the_next_begins() -> None:
+def test_the_worst_of_each_second_is_reported_when_the_next_begins() -> None:
     errors = Growing(100)
     compare = TruthCompare(errors)
     for k in range(25):
@@ -290,7 +292,7 @@ def test_what_the_loops_use_of_the_machine() -> None:
     assert 1e7 < memory < 1e10
 
 
-def test_unknown_values_are_left_out() -> None:
+def test_unknown_values_are_not_used() -> None:
     metrics = metrics_of(NOTHING)
     assert set(metrics) == {
         "ccatp_info", "ccatp_build_info", "ccatp_up", "ccatp_process_restarts_total", "ccatp_dashboard_pages",

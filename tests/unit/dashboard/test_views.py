@@ -67,7 +67,7 @@ def fix_at(point: PointId | None, ahead_m: float, t_s: float = 2.0) -> FixMessag
     )  # fmt: skip
 
 
-def told(view: RunStateView, *messages: Any, now_s: float = 1.0) -> dict[str, Any]:
+def reported(view: RunStateView, *messages: Any, now_s: float = 1.0) -> dict[str, Any]:
     """What is new after these messages, as a page gets it."""
     for message in messages:
         view.receive(message, now_s)
@@ -76,29 +76,29 @@ def told(view: RunStateView, *messages: Any, now_s: float = 1.0) -> dict[str, An
 
 
 def test_levels_are_there_each_time(view: SurveyView) -> None:
-    state = told(view)
+    state = reported(view)
     assert state["mission"] is state["pose"] is state["verdict"] is state["robot"] is None
     assert state["points"] == state["path"] == state["log"] == []
     assert state["is_sim"] is True
-    assert told(view, mission(), picture(15, LINE))["pose"] is None  # a sample for the history
+    assert reported(view, mission(), picture(15, LINE))["pose"] is None  # a sample for the history
     view.is_watched = True
-    told(view, picture(15, LINE))
+    reported(view, picture(15, LINE))
     for now_s in (1.1, 1.9):
-        state = told(view, now_s=now_s)
+        state = reported(view, now_s=now_s)
         assert (state["mission"]["state"], state["pose"]["x_m"]) == ("driving", 1.0)
         assert state["mission"]["is_stale"] is False
         assert state["robot"] == {
             "edges": [1, 0, 1, 1], "fans": [0.8, 0.7], "charge": 0.93, "drive_age_s": 0.012, "permit_age_s": 0.008,
             "is_held": False, "faults": ["stall"],
         }  # fmt: skip
-    assert told(view, now_s=2.1)["mission"]["is_stale"]
-    state = told(view, picture(15))  # before the first frame
+    assert reported(view, now_s=2.1)["mission"]["is_stale"]
+    state = reported(view, picture(15))  # before the first frame
     assert (state["robot"], state["pose"] is None) == (None, False)
     view.discard_picture()
-    assert told(view)["pose"] is None
+    assert reported(view)["pose"] is None
     assert view.everything(1.0)["series"]["nis"] == [(0.5, 2.0, 2)]  # of the same update
-    told(view, mission(exit_status=0))
-    assert (told(view, now_s=9.0)["is_over"], told(view, now_s=9.0)["mission"]["is_stale"]) == (True, False)
+    reported(view, mission(exit_status=0))
+    assert (reported(view, now_s=9.0)["is_over"], reported(view, now_s=9.0)["mission"]["is_stale"]) == (True, False)
 
 
 def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: SurveyView) -> None:
@@ -108,18 +108,18 @@ def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: SurveyView)
         (fix_at(view.points[0], 0.0), "1-2-8"),
         (mission(outcome="stopped"), ""),
     ):
-        assert told(view, message)["mission"]["next_point"] == point
+        assert reported(view, message)["mission"]["next_point"] == point
 
 
 def test_a_point_from_arrival_to_measured(view: SurveyView) -> None:
     point = view.points[0]
     arrived = ArrivalMessage(seq=8, t_s=2.0, point=(point.row, point.col, point.point), error_mm=0.3)
-    assert told(view, arrived)["points"] == [[0, ARRIVED, None]]
-    state = told(view, BEGUN, fix_at(point, 0.004))
+    assert reported(view, arrived)["points"] == [[0, ARRIVED, None]]
+    state = reported(view, BEGUN, fix_at(point, 0.004))
     # The foot lies 4 mm ahead on the deck, and a little more along the slope.
     assert state["points"] == [[0, MEASURED, pytest.approx(4.0, abs=0.3)]]
     assert state["series"] == {"arrival": [[2.0, state["points"][0][2]]], "jump": [[2.0, 0.7]]}
-    assert told(view, arrived)["points"] == []  # measured stays measured
+    assert reported(view, arrived)["points"] == []  # measured stays measured
 
 
 @pytest.mark.parametrize(
@@ -134,13 +134,13 @@ def test_fixes_that_are_no_measurements(
     view: SurveyView, is_point: bool, changes: dict[str, Any], points: list[Any], series: set[str]
 ) -> None:
     fix = fix_at(view.points[0] if is_point else None, 0.0)
-    state = told(view, BEGUN, msgspec.structs.replace(fix, **changes))
+    state = reported(view, BEGUN, msgspec.structs.replace(fix, **changes))
     assert (state["points"], set(state["series"])) == (points, series)
 
 
 def test_points_left_out(view: SurveyView) -> None:
     names = [f"{p.row}-{p.col}-{p.point}" for p in view.points[:2]]
-    news = told(view, fix_at(view.points[1], 0.0), mission(left_out={"no fix": names, "other": ["99-9-9"]}))
+    news = reported(view, fix_at(view.points[1], 0.0), mission(left_out={"no fix": names, "other": ["99-9-9"]}))
     assert [row[:2] for row in news["points"]] == [[0, SKIPPED], [1, MEASURED]]
     assert news["mission"]["not_to_be_measured"] == 3
 
@@ -152,14 +152,14 @@ def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: Surv
         deck = MIRROR.deck_pose(PanelPose(PanelId(1, 2), rows[-1][4], 0.05, 0.0))
         truths.append((k, 0.01 * k, deck.x_m + 0.002, deck.y_m, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0))
     track = TrackMessage(seq=299, t_s=3.0, rows=rows)
-    assert told(view, track)["path"] == []  # when in the mission is not known
-    state = told(view, BEGUN, track, TruthMessage(seq=299, t_s=3.0, rows=truths))
+    assert reported(view, track)["path"] == []  # when in the mission is not known
+    state = reported(view, BEGUN, track, TruthMessage(seq=299, t_s=3.0, rows=truths))
     path = np.array(state["path"])
     assert hypot(*(path[-1] - path[0])[1:]) == pytest.approx(0.28, abs=0.01)
     assert path[-1][0] == pytest.approx(2.8, abs=0.2)
     assert [[round(value, 3) for value in row[1:]] for row in state["series"]["error"]] == [[2.0, 3.0], [2.0, 3.0]]
     blind = SurveyView(MIRROR, CFG, is_sim=False)  # without a truth sigma alone is shown
-    assert told(blind, BEGUN, track)["series"]["error"] == [[0.0, None, 3.0], [1.0, None, 3.0], [2.0, None, 3.0]]
+    assert reported(blind, BEGUN, track)["series"]["error"] == [[0.0, None, 3.0], [1.0, None, 3.0], [2.0, None, 3.0]]
 
 
 def test_the_verdict_and_its_cause(view: SurveyView) -> None:
@@ -168,36 +168,36 @@ def test_the_verdict_and_its_cause(view: SurveyView) -> None:
         forward=False, reverse=True, turn=False, off=(True, False, False, False), severity=Severity.NONE,
     )  # fmt: skip
     more = {"text": "edge (front left): 0.006 (limit 0.005)", "is_stale": False}
-    assert told(view, verdict)["verdict"] == json.loads(msgspec.json.encode(verdict)) | more
-    assert told(view, now_s=2.5)["verdict"]["is_stale"]
+    assert reported(view, verdict)["verdict"] == json.loads(msgspec.json.encode(verdict)) | more
+    assert reported(view, now_s=2.5)["verdict"]["is_stale"]
     event = DangerEvent(
         seq=4, t_s=1.25, code=2, cause="fire", signal="emergency:fire", value=1.0, limit=0.0, off=(False,) * 4,
         severity=5,
     )  # fmt: skip
-    state = told(view, event)
+    state = reported(view, event)
     assert (state["verdict"]["code"], "forward" in state["verdict"]) == (2, False)
 
 
 def test_the_alarms_are_those_of_the_status_until_the_run_is_over(view: SurveyView) -> None:
-    assert told(view)["alarms"] == []
+    assert reported(view)["alarms"] == []
     alarm = Alarm(
         name="no_way_on", severity="fault", cause="no way on: rim", advice="carry it", since="now", since_s=1.0
     )
-    state = told(view, mission(state="held", alarms=[alarm]))
+    state = reported(view, mission(state="held", alarms=[alarm]))
     assert state["alarms"] == [msgspec.to_builtins(alarm)]
     assert "alarms" not in state["mission"]
-    assert told(view, mission(alarms=[alarm], exit_status=0))["alarms"] == []
+    assert reported(view, mission(alarms=[alarm], exit_status=0))["alarms"] == []
 
 
 def test_other_things_on_the_map(view: SurveyView) -> None:
-    assert "shapes" not in told(view)
+    assert "shapes" not in reported(view)
     beacon = RobotShape(id="b1", kind="beacon", x_m=1.0, y_m=2.0, covariance_m2=(0.1, 0.0, 0.1), label="b1")
     wall = RobotShape(id="w", kind="obstacle", x_m=0.0, y_m=0.0, outline_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)])
-    shapes = told(view, Scene(seq=1, t_s=1.0, shapes=[beacon, wall]))["shapes"]
+    shapes = reported(view, Scene(seq=1, t_s=1.0, shapes=[beacon, wall]))["shapes"]
     place = {"x_m": 1.0, "y_m": 2.0, "covariance_m2": [0.1, 0.0, 0.1]}
     assert shapes[0] == {"id": "b1", "kind": "beacon", "label": "b1"} | place
     assert shapes[1]["outline_m"] == [[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
-    assert "shapes" not in told(view)  # nothing new
+    assert "shapes" not in reported(view)  # nothing new
     assert len(view.everything(1.1)["shapes"]) == 2
 
 
@@ -210,7 +210,7 @@ def test_everything_is_the_sum_of_the_news_and_no_path_is_drawn_where_nothing_is
     for k in range(6):
         t_s = float(k) if k < 4 else 60.0 + k  # a minute without a word
         track = TrackMessage(seq=10 * k, t_s=t_s, rows=[track_row(10 * k, t_s, 0.05 * k)])
-        news = told(view, BEGUN, fix_at(view.points[k], 0.001 * k, t_s=t_s), track)
+        news = reported(view, BEGUN, fix_at(view.points[k], 0.001 * k, t_s=t_s), track)
         points |= {row[0]: row for row in news["points"]}
         path += news["path"]
         arrivals += news["series"]["arrival"]
@@ -221,15 +221,15 @@ def test_everything_is_the_sum_of_the_news_and_no_path_is_drawn_where_nothing_is
     assert everything["series"]["arrival"] == arrivals
 
 
-def test_the_time_of_the_mission_goes_on_when_the_clock_of_the_robot_begins_again(view: SurveyView) -> None:
-    told(view, mission(t_s=100.0, elapsed_s=90.0), fix_at(view.points[0], 0.001, t_s=101.0))
-    told(view, mission(t_s=1.0, elapsed_s=95.0), fix_at(view.points[1], 0.001, t_s=2.0))
+def test_the_time_of_the_mission_continues_when_the_clock_of_the_robot_begins_again(view: SurveyView) -> None:
+    reported(view, mission(t_s=100.0, elapsed_s=90.0), fix_at(view.points[0], 0.001, t_s=101.0))
+    reported(view, mission(t_s=1.0, elapsed_s=95.0), fix_at(view.points[1], 0.001, t_s=2.0))
     assert [row[0] for row in view.everything(0.0)["series"]["arrival"]] == [91.0, 96.0]
 
 
 def test_when_the_mission_ends_at_its_pace(view: SurveyView) -> None:
     def finish_in_s(now_s: float, **fields: Any) -> float | None:
-        found: float | None = told(view, mission(**fields), now_s=now_s)["mission"]["finish_in_s"]
+        found: float | None = reported(view, mission(**fields), now_s=now_s)["mission"]["finish_in_s"]
         return found
 
     assert finish_in_s(0.0, elapsed_s=0.0, eta_s=100.0) is None  # it has not begun
@@ -238,9 +238,9 @@ def test_when_the_mission_ends_at_its_pace(view: SurveyView) -> None:
     assert finish_in_s(22.0, elapsed_s=60.0, eta_s=100.0, outcome="stopped") is None
 
 
-def test_what_an_operator_held_is_told_from_what_a_fault_held(view: SurveyView) -> None:
+def test_a_hold_by_an_operator_is_distinguished_from_one_by_a_fault(view: SurveyView) -> None:
     for cause, is_by_operator in (("operator", True), ("no way on: rim", False), ("", False)):
-        assert told(view, mission(state="held", cause=cause))["mission"]["is_by_operator"] is is_by_operator
+        assert reported(view, mission(state="held", cause=cause))["mission"]["is_by_operator"] is is_by_operator
 
 
 def test_messages_and_emergencies_are_those_of_the_run_directory(tmp_path: Path) -> None:
@@ -254,7 +254,7 @@ def test_messages_and_emergencies_are_those_of_the_run_directory(tmp_path: Path)
     (tmp_path / "log.jsonl").write_text(text[:-20])
     (tmp_path / "emergencies.json").write_text('{"active": [{"kind": "fire", "id": "7", "note": ""}], "cleared": []}')
     view.read_files()
-    state = told(view)
+    state = reported(view)
     assert (state["started"], state["emergencies"]) == (begun["timestamp"], [{"kind": "fire", "id": "7", "note": ""}])
     assert state["log"] == [
         ["2026-11-26T03:32:00.5Z", "error", "a line", 1, 1],
@@ -263,7 +263,7 @@ def test_messages_and_emergencies_are_those_of_the_run_directory(tmp_path: Path)
     with (tmp_path / "log.jsonl").open("a") as log:  # the rest of the line, and damage
         log.write(text[-20:] + 'x"operator_message"\n' + json.dumps(said | {"text": "another"}) + "\n")
     view.read_files()
-    assert [row[2] for row in told(view)["log"]] == ["another"]
+    assert [row[2] for row in reported(view)["log"]] == ["another"]
     view.close()
 
 
@@ -277,7 +277,7 @@ async def test_plots_and_path_of_a_dashboard_that_came_late_are_read_from_the_re
         for name, message in (("mission", BEGUN), ("track", track), ("fix", fix_at(view.points[k], 0.001, float(k)))):
             recorder.write(name, float(k), msgspec.json.encode(message))
     recorder.close()
-    told(view, BEGUN, fix_at(view.points[8], 0.001, 6.5))  # and from here on it listens
+    reported(view, BEGUN, fix_at(view.points[8], 0.001, 6.5))  # and from here on it listens
     past = SurveyView(MIRROR, CFG, is_sim=True)
     paths = [tmp_path / "missing.mcap", tmp_path / "telemetry.mcap"]
     await replay(paths, ("mission", "track", "fix"), lambda message: past.receive(message, 0.0))
@@ -288,7 +288,7 @@ async def test_plots_and_path_of_a_dashboard_that_came_late_are_read_from_the_re
 
 
 def test_the_last_fix_and_the_limits_that_go_with_what_is_shown(view: SurveyView) -> None:
-    state = told(view, fix_at(view.points[0], 0.001))
+    state = reported(view, fix_at(view.points[0], 0.001))
     assert state["laser"] == {"dop": 1.0, "residual_um": 1.0, "channels": [1, 2, 3, 4], "is_used": True}
     cfg = config_of(health__battery_reserve=0.31, etalon__max_dop=17.0, mission__arrival_tolerance_m=0.012)
     ground = survey_ground(MIRROR, cfg, is_sim=True)
@@ -344,25 +344,25 @@ def test_waypoints_are_done_one_after_the_other_and_anew_in_the_next_lap(room: B
         BeaconArrival(seq=1, t_s=1.0, waypoint=waypoint, lap=lap, place=(0.8, 0.8), estimate=ELLIPSE)
         for waypoint, lap in ((0, 0), (1, 0), (0, 1))
     )
-    assert told(room, first, second)["points"] == [[0, MEASURED, None], [1, MEASURED, None]]
-    assert told(room)["points"] == []
-    assert told(room, again)["points"] == [[0, MEASURED, None], *([k, PLANNED, None] for k in (1, 2, 3))]
+    assert reported(room, first, second)["points"] == [[0, MEASURED, None], [1, MEASURED, None]]
+    assert reported(room)["points"] == []
+    assert reported(room, again)["points"] == [[0, MEASURED, None], *([k, PLANNED, None] for k in (1, 2, 3))]
     assert room.everything(0.0)["points"] == [[0, MEASURED, None]]
 
 
 def test_the_map_against_what_is_expected_and_what_is_true(room: BeaconView) -> None:
     places = BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 0.0), "b": (3.0, 0.0)})
-    series = told(room, places, told_map(), told_map(1.5, nis_sum=6.0, nis_size=4, refused=2))["series"]
+    series = reported(room, places, told_map(), told_map(1.5, nis_sum=6.0, nis_size=4, refused=2))["series"]
     # Root mean squares of 0.3 and 0.4 m, and of variances of 0.04 for each place, in mm.
     assert series["map"] == [[1.5, pytest.approx(353.55), pytest.approx(200.0)]]
     assert (series["nis"], series["clearance"]) == ([[1.5, 6.0, 4]], [[1.5, 0.7]])
-    assert told(room, told_map(2.0, nis_sum=7.0, nis_size=6, refused=2))["series"]["nis"] == [[2.0, 1.0, 2]]
-    assert "nis" not in told(room, told_map(2.5))["series"]  # of another main loop: it begins anew
+    assert reported(room, told_map(2.0, nis_sum=7.0, nis_size=6, refused=2))["series"]["nis"] == [[2.0, 1.0, 2]]
+    assert "nis" not in reported(room, told_map(2.5))["series"]  # of another main loop: it begins anew
 
 
 def test_facts(room: BeaconView) -> None:
-    assert told(room)["facts"] == []
-    assert dict(told(room, told_map(nis_sum=6.0, nis_size=4, refused=2))["facts"]) == {
+    assert reported(room)["facts"] == []
+    assert dict(reported(room, told_map(nis_sum=6.0, nis_size=4, refused=2))["facts"]) == {
         "beacons on the map": "2", "error of the map, expected": "200.0 mm", "readings used, refused": "4, 2",
         "mean NIS": "1.50", "to the waypoint": "1.40 m", "lap": "1 of 2",
     }  # fmt: skip
@@ -371,7 +371,7 @@ def test_facts(room: BeaconView) -> None:
 def test_a_target_is_followed() -> None:
     target = (1.8, 0.8, 0.01, 0.0, 0.01)
     known: dict[str, Any] = {"target": target, "beacons": {"target": target}, "waypoints": [], "next_waypoint": -1}
-    state = told(BeaconView(radio("follow"), is_sim=True), BEGUN, *(told_map(t_s, **known) for t_s in (1.0, 1.5)))
+    state = reported(BeaconView(radio("follow"), is_sim=True), BEGUN, *(told_map(t_s, **known) for t_s in (1.0, 1.5)))
     assert state["series"]["target"] == [[1.5, 1.0, 0.6]]
     assert "map" not in state["series"]  # the one that moves is none of the map
     assert dict(state["facts"])["distance to the target"] == "1.00 m"
@@ -380,14 +380,14 @@ def test_a_target_is_followed() -> None:
 def test_the_error_against_the_truth_is_the_worst_of_each_second(room: BeaconView) -> None:
     rows: Any = [(k, 0.1 * k, 1.0, 2.0, 0.0, 4e-4, 0.0, 1e-4, 0.0, 0.0, 1e-4, 1.0, 2.0) for k in (10, 15, 20)]
     true: Any = [(k, 0.1 * k, 1.0, 2.01, 0.0, None, None, None) for k in (10, 15, 20)]
-    state = told(room, BeaconTrack(seq=20, t_s=2.0, rows=rows), BeaconTruth(seq=20, t_s=2.0, rows=true))
+    state = reported(room, BeaconTrack(seq=20, t_s=2.0, rows=rows), BeaconTruth(seq=20, t_s=2.0, rows=true))
     assert state["series"]["error"] == [[1.0, pytest.approx(10.0), pytest.approx(60.0)]]
 
 
 def test_the_scene_without_what_the_page_draws_itself(room: BeaconView) -> None:
     kinds = ("robot", "trail", "waypoint", "beacon", "obstacle")
     scene = Scene(seq=1, t_s=1.0, shapes=[RobotShape(kind, kind, 1.0, 1.0) for kind in kinds])
-    state = told(room, BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 1.0)}), scene)
+    state = reported(room, BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 1.0)}), scene)
     assert [shape["kind"] for shape in state["shapes"]] == ["true", "beacon", "obstacle"]
     assert state["shapes"][0]["y_m"] == 1.0
     assert [link["name"] for link in state["links"]] == ["main loop", "danger loop", "robot"]  # no laser
@@ -408,7 +408,7 @@ def test_the_ground_of_a_room(system: str) -> None:
     assert [part for part in parts if f'id="{part}"' not in page] == []
 
 
-def test_a_page_beyond_this_machine_wants_a_token() -> None:
+def test_a_page_beyond_this_machine_needs_a_token() -> None:
     with pytest.raises(ConfigError, match=r"dashboard\.host = \"0\.0\.0\.0\" is beyond this machine"):
         radio(**{"dashboard.host": "0.0.0.0"})
 

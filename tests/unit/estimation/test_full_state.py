@@ -204,7 +204,7 @@ def test_who_begins_anew_twice_in_a_row_forgets_what_was_learned() -> None:
         ({"t_s": 0.0}, "outside the known path"),
     ],
 )
-def test_a_fix_that_says_nothing_is_refused(change: dict[str, Any], match: str) -> None:
+def test_a_fix_that_reports_nothing_is_refused(change: dict[str, Any], match: str) -> None:
     found = build()
     robot = rested(found)
     run(found, robot.frames(2.8))

@@ -244,7 +244,7 @@ def test_a_frame_without_samples_is_not_fresh() -> None:
     assert not wheel.is_fresh
 
 
-def test_lost_samples_of_a_counter_are_told() -> None:
+def test_lost_samples_of_a_counter_are_reported() -> None:
     """A count belongs to its own period; what was lost before it is taken from the last motion, and told."""
     wheel = counter()
     rate = 3.3

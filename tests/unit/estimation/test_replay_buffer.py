@@ -171,9 +171,9 @@ def test_a_late_fix_is_as_good_as_one_in_time(
     story = Story(
         name, filter_name, use={"slip_per_leg": False}, rewind_s=3.0, turn_creep_sigma_m_rad=turn_creep_sigma_m_rad
     )
-    taken, told = story.end_after(taken_s), story.end_after(told_s)
+    taken, reported = story.end_after(taken_s), story.end_after(told_s)
     fix = story.fixes[taken]
-    in_time, late = story.tell({taken: [fix]}), story.tell({told: [fix]})
+    in_time, late = story.tell({taken: [fix]}), story.tell({reported: [fix]})
     assert (in_time.counts["late_fixes"], late.counts["late_fixes"]) == (0, 1)
     mean, covariance = apart(in_time, late)
     # The ground is looked up where the filter thought it was: slopes off by 1e-7 in some hundred steps. Sigma points
@@ -188,8 +188,8 @@ def test_a_fix_within_a_block_is_carried_to_its_end(inside: int) -> None:
     """In time it ends the block, so the noise of the block is taken in other portions: that is what differs."""
     story = Story("straight on")
     end = story.end_after(1.8)
-    taken, told = end - inside, story.end_after(2.6)
-    in_time, late = (story.tell({k: [story.fixes[taken]]}) for k in (taken, told))
+    taken, reported = end - inside, story.end_after(2.6)
+    in_time, late = (story.tell({k: [story.fixes[taken]]}) for k in (taken, reported))
     pose = [np.array([found.deck_pose.x_m, found.deck_pose.y_m]) for found in (in_time, late)]
     # v times the time to the block's end would be 1 mm for each frame.
     assert np.abs(pose[0] - pose[1]).max() < 5e-5

@@ -349,10 +349,10 @@ def test_the_next_leg_is_given_what_bayes_gives_it(full: FullStateConfig) -> Non
         found = TO_PARAMETERS @ covariance @ TO_PARAMETERS.T
         across = TO_PARAMETERS @ F @ posterior @ TO_PARAMETERS.T  # of the next leg's with the last one's
         for k in range(3 if leg == 0 else 2):
-            told = by_bayes(*priors[k], scatters[k], seen[k], noises[k])
-            assert TO_PARAMETERS[k] @ mean == pytest.approx(told.mean, rel=1e-9)  # rounding
-            assert across[k, k] == pytest.approx(told.correlation, rel=1e-9)
-            assert found[k, k] == pytest.approx(told.variance, rel=1e-9)
+            reported = by_bayes(*priors[k], scatters[k], seen[k], noises[k])
+            assert TO_PARAMETERS[k] @ mean == pytest.approx(reported.mean, rel=1e-9)  # rounding
+            assert across[k, k] == pytest.approx(reported.correlation, rel=1e-9)
+            assert found[k, k] == pytest.approx(reported.variance, rel=1e-9)
         x[DRAWN], P[np.ix_(DRAWN, DRAWN)] = mean, covariance
 
 

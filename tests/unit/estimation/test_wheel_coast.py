@@ -90,7 +90,7 @@ def test_every_growth_of_the_covariance_is_one() -> None:
             assert both * both <= right * left * (1.0 + 1e-9) + 1e-30
 
 
-def test_without_set_points_anything_from_going_on_to_a_stop_is_as_likely() -> None:
+def test_without_set_points_anything_from_running_to_a_stop_is_as_likely() -> None:
     coast = WheelCoast(0.08)
     coast.begin(3.0, 3.0, 0.0, is_resting=False)
     frames = [coast.advance(FRAME_S, None) for _ in range(100)]
@@ -132,7 +132,7 @@ def test_the_echo_says_which_drive_acted_for_how_long(echo: dict[str, float], ri
     assert found.right_doubt_rad == 0.0
 
 
-def test_a_robot_that_holds_by_a_rule_of_its_own_stopped_at_an_unknown_moment_of_the_frame() -> None:
+def test_a_robot_that_holds_by_itself_stopped_at_an_unknown_time_of_the_frame() -> None:
     found = acted(seq=7, age=0.1, permit_age=0.1, held=True)
     assert found is not None
     assert found.right_rad_s == pytest.approx(1.0)

@@ -59,7 +59,7 @@ def test_points_that_do_not_span_the_panel_fit_nothing(m1: Mirror, count: int, f
     assert list(fit_panels(m1, points, HEIGHT_M)) == fitted
 
 
-def test_deviations_are_told_with_their_places(m1: Mirror) -> None:
+def test_deviations_are_reported_with_their_places(m1: Mirror) -> None:
     found = deviations_of(m1, PANEL, measured(m1), HEIGHT_M, 0.0)
     # The tilted puck moves its foot by 0.05 m times 140 urad = 7 um.
     x, y = found.places_m.T

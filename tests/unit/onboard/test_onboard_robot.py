@@ -238,7 +238,7 @@ def test_a_burst_of_samples_keeps_the_newest_in_a_line_that_fits(monkeypatch: py
     assert bench.robot.dropped_samples > 300
 
 
-def test_a_robot_that_slides_holds_itself_with_full_fans_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_that_slides_holds_itself_with_full_fans_and_reports_it(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench("fyst-m1")
     read, slide = bench.hardware.read, 0.0
 
@@ -275,7 +275,7 @@ def test_frames_that_a_stop_left_out_are_not_made_up_for() -> None:
     assert before == 10
 
 
-def test_a_frame_is_of_so_long_ago_that_it_holds_every_sample_since_the_one_before() -> None:
+def test_a_frame_is_delayed_so_that_it_contains_every_sample_since_the_last_one() -> None:
     bench = Bench()
     link = CFG.link.model_copy(update={"sample_latency_s": 0.015})
     bench.robot = OnboardRobot(CFG.model_copy(update={"link": link}), bench.hardware)
@@ -425,7 +425,7 @@ def test_every_module_of_the_package_can_be_imported_and_none_needs_the_big_pack
     assert {"numpy", "pydantic", "structlog", "click", "msgspec"} <= named & set(third_party.split())
 
 
-def test_the_command_of_the_package_says_what_is_missing(package: Path) -> None:
+def test_the_command_of_the_package_names_what_is_missing(package: Path) -> None:
     start = "import sys; from ccatp.cli.onboard import main; sys.exit(main())"
     done = run(package, "-c", start, "--set", "devices.motors.gpio_chip=/nowhere", "--port", "0", "--host", "127.0.0.1")
     assert done.returncode == 5

@@ -158,7 +158,7 @@ def test_a_drive_read_first_after_a_long_stop_lives_no_longer_than_any_other(rig
     assert r.server.counts["slips"] == 1
 
 
-def test_after_a_long_stop_the_clock_goes_on_where_it_stood(rig: Rig) -> None:
+def test_after_a_long_stop_the_clock_continues_where_it_stood(rig: Rig) -> None:
     r = rig(lockstep=False)
     controller = r.client(JOIN)
     r.run(0.1)
@@ -266,7 +266,7 @@ def test_the_server_and_the_calls_give_the_same_frames(mirror: Mirror) -> None:
         ('signal = "soc"\ntype = "stuck"\nvalue = 7.0', [1, 2, 3, 4, 5, 6, 7, 8, 9]),
     ],
 )
-def test_lockstep_goes_on_past_frames_that_nobody_can_answer(rig: Rig, plan: str, expected: list[int]) -> None:
+def test_lockstep_continues_past_frames_that_nobody_can_answer(rig: Rig, plan: str, expected: list[int]) -> None:
     r = rig(plan=parse_plan(f"[[fault]]\nat_s = 0.05\nfor_s = 0.03\n{plan}", "plan"))
     controller, seen, answers = r.client(JOIN), list[str](), 0
     controller.messages.clear()
@@ -280,7 +280,7 @@ def test_lockstep_goes_on_past_frames_that_nobody_can_answer(rig: Rig, plan: str
         assert answers == 9 - 3  # three frames were not answered by anybody
 
 
-def test_a_robot_that_is_never_heard_again_ends_the_session(rig: Rig) -> None:
+def test_a_robot_that_is_never_received_again_ends_the_session(rig: Rig) -> None:
     r = rig(plan=fault_plan({"signal": "frames", "type": "drop", "at_s": 0.05, "every": 1}))
     controller = r.client(JOIN)
     for number in range(6):

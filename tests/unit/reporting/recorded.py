@@ -217,12 +217,12 @@ def beacon_map(frame: int, cfg: RadioConfig) -> BeaconMapMessage:
     if cfg.follow.is_active:
         target = (place(frame)[0] + 1.0, 0.8, 0.01, 0.0, 0.01)
         beacons["target"] = target
-    told = frame // 5
+    reported = frame // 5
     return BeaconMapMessage(
         seq=frame, t_s=PERIOD_S * frame, system=cfg.system, pose=(*place(frame), 0.0),
         pose_ellipse=(*place(frame), *ELLIPSE), beacons=beacons, target=target, obstacles=[(1.0, 2.0)],
         waypoints=[] if cfg.follow.is_active else list(cfg.workspace.waypoints_m), next_waypoint=1,
-        distances=[1.5, 0.9], nis_sum=3.0 * told, nis_size=2 * told, refused=1, notes={},
+        distances=[1.5, 0.9], nis_sum=3.0 * reported, nis_size=2 * reported, refused=1, notes={},
     )  # fmt: skip
 
 

@@ -58,11 +58,11 @@ def test_a_waypoint_that_was_reached(run_dir: Path) -> None:
 def test_the_command_and_the_page(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "page.html"
     assert printed(capsys, "report", run_dir, "--out", path) == f"{path}\n"
-    told = answered(capsys, "report", run_dir, "--out", path)
-    assert told["report"] == str(path)
-    assert (told["system"], told["seed"], told["outcome"]) == ("zigbee", 5, "complete")
-    assert told["waypoints"] == {"total": 4, "reached": 1, "within_3_sigma": 1}
-    assert (told["nis_mean"], told["position_error_m"]) == (1.5, {"rms": OFF_M, "max": OFF_M})
+    reported = answered(capsys, "report", run_dir, "--out", path)
+    assert reported["report"] == str(path)
+    assert (reported["system"], reported["seed"], reported["outcome"]) == ("zigbee", 5, "complete")
+    assert reported["waypoints"] == {"total": 4, "reached": 1, "within_3_sigma": 1}
+    assert (reported["nis_mean"], reported["position_error_m"]) == (1.5, {"rms": OFF_M, "max": OFF_M})
     page = path.read_text()
     markup = Markup(page)
     assert (markup.outside, markup.anchors) == ([], ALL)

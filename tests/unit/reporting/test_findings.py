@@ -71,11 +71,11 @@ def test_grades(record: RunRecord) -> None:
     statuses = ("measured", "measured", "measured", "skipped", "planned")
     rows = [StoredPoint(point, 0.0, 0.0, status, None, None) for point, status in zip(points, statuses, strict=True)]
     session = only(record)
-    told = msgspec.structs.replace(session.statuses[-1], left_out={"no fix: too few channels": ["1-2-4"]})
+    reported = msgspec.structs.replace(session.statuses[-1], left_out={"no fix: too few channels": ["1-2-4"]})
     corrected = next(fix for fix in session.fixes if fix.point == tuple(points[2]))
     x, y, z = corrected.position_m
     arrived = msgspec.structs.replace(corrected, position_m=(x, y + 0.02, z))
-    blind = replace(session, truth=None, statuses=(told,), fixes=(arrived, *session.fixes))
+    blind = replace(session, truth=None, statuses=(reported,), fixes=(arrived, *session.fixes))
     measured = (fixes[points[0]], moved, fixes[points[2]])
     found = point_verdicts(replace(record, points=tuple(rows), measured=measured, sessions=(blind,)))
     assert [str(verdict.grade) for verdict in found] == ["pass", "fail", "corrected", "skipped", "not measured"]
@@ -88,8 +88,8 @@ def test_grades(record: RunRecord) -> None:
 
 
 def budget_of(record: RunRecord, *changes: tuple[int, str, str], **fields: object) -> TimeBreakdown:
-    told = tuple(StateChange(*change) for change in changes)
-    session = replace(only(record), changes=told, **fields)  # type: ignore[arg-type]
+    reported = tuple(StateChange(*change) for change in changes)
+    session = replace(only(record), changes=reported, **fields)  # type: ignore[arg-type]
     found = time_budget(replace(record, sessions=(session,)))
     assert found is not None
     return found
@@ -122,10 +122,15 @@ def test_a_longer_measurement_waited(record: RunRecord) -> None:
 
 def test_what_passed_while_main_was_restarted_is_a_row(record: RunRecord) -> None:
     """Main was gone from 3 s to 7 s of robot time; its successor speaks first before it has seen a frame."""
-    told = [(100, 1.0, 1.0, "driving"), (300, 3.0, 3.0, "driving"), (-1, 0.0, 3.0, "idle"), (710, 7.1, 3.1, "settling")]
+    reported = [
+        (100, 1.0, 1.0, "driving"),
+        (300, 3.0, 3.0, "driving"),
+        (-1, 0.0, 3.0, "idle"),
+        (710, 7.1, 3.1, "settling"),
+    ]
     statuses: tuple[MissionStatus, ...] = tuple(
         msgspec.structs.replace(only(record).statuses[0], seq=seq, t_s=t_s, elapsed_s=elapsed_s, state=state)
-        for seq, t_s, elapsed_s, state in told
+        for seq, t_s, elapsed_s, state in reported
     )
     changes = ((100, "idle", "driving"), (690, "idle", "settling"), (710, "settling", "done"))
     found = budget_of(record, *changes, statuses=statuses)
@@ -166,7 +171,7 @@ def test_a_recording_torn_in_its_first_bytes(run_dir: Path) -> None:
     assert found.alignment is not None  # the fixes are in the database
 
 
-def test_what_is_missing_is_told(without: Callable[..., Path]) -> None:
+def test_what_is_missing_is_reported(without: Callable[..., Path]) -> None:
     assert not findings_of(read_record(without("log.jsonl"))).budget.is_exact  # type: ignore[union-attr]
     found = read_record(without("telemetry.mcap", "mission.sqlite", "summary.json"))
     assert found.missing == (
@@ -187,14 +192,14 @@ def test_what_is_missing_is_told(without: Callable[..., Path]) -> None:
         ("mission.sqlite", bytes(5000), "mission.sqlite: damaged or not a mission store: file is not a database"),
     ],
 )
-def test_what_is_spoilt_is_left_out(name: str, content: bytes, warning: str, run_dir: Path) -> None:
+def test_what_is_spoilt_is_not_used(name: str, content: bytes, warning: str, run_dir: Path) -> None:
     (run_dir / name).write_bytes(content)
     found = read_record(run_dir)
     assert (found.summary if name == "summary.json" else found.points) is None
     assert [one.startswith(warning) for one in found.warnings] == [True]
 
 
-def test_messages_of_another_version_are_left_out(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_of_another_version_are_not_used(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (run_dir / "telemetry.mcap").unlink()
     recorder = Recorder(run_dir / "telemetry.mcap", [("track", {}), ("fix", {})], is_simulation=False)
     recorder.write("track", 1.0, b'{"seq":1,"t_s":1.0,"rows":[[0,0.0,99,99,0,0,0,0]]}')

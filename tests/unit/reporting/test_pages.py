@@ -56,8 +56,8 @@ def test_the_page_of_a_whole_run(recorded: Path) -> None:
 
 def test_a_real_robot_is_called_one_and_has_no_truth(tmp_path: Path) -> None:
     found = findings_of(read_record(record(tmp_path / "real", is_simulation=False, only=4)))
-    told = found.record
-    assert (told.is_simulation, told.has_truth, told.injected, told.missing) == (False, False, None, ())
+    reported = found.record
+    assert (reported.is_simulation, reported.has_truth, reported.injected, reported.missing) == (False, False, None, ())
     assert found.errors is not None
     assert np.isnan(found.errors.error_mm).all()
     assert (found.figures, found.against) == (None, None)
@@ -311,7 +311,7 @@ CLEAN = [
 OVER = "The mission is over: the processes close their connections and end."
 
 
-def test_a_clean_run_says_so_in_one_line() -> None:
+def test_a_clean_run_reports_it_in_one_line() -> None:
     shown, folded = events_body(CLEAN).split("<details>")
     assert plain(shown) == "No warnings, no errors, no restarts: 5 lines of information."
     assert folded.index("joined") < folded.index(OVER) < folded.index("gate statistics") < folded.index("lost")
@@ -360,16 +360,16 @@ def test_a_page_stays_small_however_much_went_wrong(run_dir: Path) -> None:
 @pytest.mark.usefixtures("drawn")
 def test_the_command(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figures = tmp_path / "figures" / "deep"
-    told = answered(capsys, "report", run_dir, "--figures", figures)
-    assert told["report"] == str(run_dir / "report.html")
+    reported = answered(capsys, "report", run_dir, "--figures", figures)
+    assert reported["report"] == str(run_dir / "report.html")
     assert (run_dir / "report.html").stat().st_size > 100_000
     assert not list(run_dir.glob("*.new"))
     names = ("path", "surface", "time", "localization")
     assert {path.name for path in figures.iterdir()} == {f"{n}.{s}" for n in names for s in ("svg", "png", "pdf")}
     summary = json.loads((run_dir / "summary.json").read_text())
-    assert told["points"] == {"total": 9, "pass": 9, "corrected": 0, "fail": 0, "skipped": 0, "not_measured": 0}
-    assert told["arrival_error_mm"]["max"] == pytest.approx(summary["arrival_error_mm"]["max"], abs=1e-3)
-    assert told["time_budget_s"]["total"] == pytest.approx(summary["mission_time_s"], abs=0.02)
+    assert reported["points"] == {"total": 9, "pass": 9, "corrected": 0, "fail": 0, "skipped": 0, "not_measured": 0}
+    assert reported["arrival_error_mm"]["max"] == pytest.approx(summary["arrival_error_mm"]["max"], abs=1e-3)
+    assert reported["time_budget_s"]["total"] == pytest.approx(summary["mission_time_s"], abs=0.02)
 
 
 def test_refusals_and_warnings(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -386,6 +386,6 @@ def test_refusals_and_warnings(run_dir: Path, tmp_path: Path, capsys: pytest.Cap
         report_run(run_dir, tmp_path / "no" / "a.html")
     (run_dir / "summary.json").write_text("{")
     assert main(["report", str(run_dir), "--json"]) == 0
-    told = capsys.readouterr()
-    assert told.err.startswith("ccatp: warning: summary.json: cannot be read: ")
-    assert json.loads(told.out)["warnings"][0].startswith("summary.json: ")
+    reported = capsys.readouterr()
+    assert reported.err.startswith("ccatp: warning: summary.json: cannot be read: ")
+    assert json.loads(reported.out)["warnings"][0].startswith("summary.json: ")

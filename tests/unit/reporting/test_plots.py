@@ -113,8 +113,8 @@ def test_a_map_of_a_run_shows_what_it_is_given(mirror: Mirror) -> None:
     low, high = mirror.rim.vertices.min(axis=0), mirror.rim.vertices.max(axis=0)
     assert axes.get_xlim()[0] < low[0] < high[0] < axes.get_xlim()[1]
     shown = {title.text for title in ET.fromstring(svg_of(figure)).iter(f"{{{SVG}}}title")}
-    told = ("pass, measured at 1.00 mm", "fail, measured at 55.00 mm", "skipped", "not measured")
-    assert shown == {f"5/5/{number}: {text}" for number, text in enumerate(told, 1)}
+    reported = ("pass, measured at 1.00 mm", "fail, measured at 55.00 mm", "skipped", "not measured")
+    assert shown == {f"5/5/{number}: {text}" for number, text in enumerate(reported, 1)}
     phone = ET.fromstring(svg_of(run_map(mirror, path_m, points, NARROW, "title")))
     assert not list(phone.iter(f"{{{SVG}}}title"))
     for some in ([], [verdict((0.0, 0.0), 0.0, Grade.GOOD)]):

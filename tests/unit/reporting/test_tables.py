@@ -114,15 +114,15 @@ def test_the_worst_corner_is_that_of_the_plane(survey: Path) -> None:
 
 @pytest.mark.parametrize("name", ["fixes", "panels", "moves"])
 def test_every_table_says_what_it_is_of(survey: Path, name: str) -> None:
-    told = read(survey, name).meta
-    assert told["operator"] == OPERATOR
-    assert (told["telescope"], told["mirror"], told["run"]) == ("FYST", "fyst-m1", "tonight")
-    assert told["robot_serial_number"] == "7"
-    assert told["laser_serial_number"] == "null"  # not a null of YAML
-    assert told["retroreflector_serial_number"] == "0012"  # nor a number
-    assert told["date_obs"] == told["date_end"] == "2026-01-01T12:00:00.5Z"
-    assert "comment" not in told
-    assert told["points_of_the_mirror"] == 9 * told["panels_of_the_mirror"]
+    reported = read(survey, name).meta
+    assert reported["operator"] == OPERATOR
+    assert (reported["telescope"], reported["mirror"], reported["run"]) == ("FYST", "fyst-m1", "tonight")
+    assert reported["robot_serial_number"] == "7"
+    assert reported["laser_serial_number"] == "null"  # not a null of YAML
+    assert reported["retroreflector_serial_number"] == "0012"  # nor a number
+    assert reported["date_obs"] == reported["date_end"] == "2026-01-01T12:00:00.5Z"
+    assert "comment" not in reported
+    assert reported["points_of_the_mirror"] == 9 * reported["panels_of_the_mirror"]
     lines = (survey / "tables" / f"{name}.csv").read_text(encoding="utf-8").split("\n")
     head = [line for line in lines if line.startswith("#")]
     assert '# telescope: "FYST"' in head
@@ -146,9 +146,9 @@ def test_panels_without_a_result_have_masked_values(tmp_path: Path) -> None:
 
 
 def test_the_command_writes_tables(survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = answered(capsys, "report", survey, "--out", tmp_path / "a.html", "--tables", tmp_path / "tables")
-    assert told["observation"]["operator"] == OPERATOR
-    assert told["coverage"]["panels_determined"] == 1
+    reported = answered(capsys, "report", survey, "--out", tmp_path / "a.html", "--tables", tmp_path / "tables")
+    assert reported["observation"]["operator"] == OPERATOR
+    assert reported["coverage"]["panels_determined"] == 1
     assert len(list((tmp_path / "tables").iterdir())) == 6
     page = (tmp_path / "a.html").read_text()
     for text in ("FYST", "J. D\u00f6\u00e9: &#34;night&#34;", "robot serial number", "0012"):

@@ -493,13 +493,13 @@ def test_a_sensor_about_which_the_robot_turns_does_not_move() -> None:
 
 
 @pytest.mark.parametrize("heading", [0.5, -2.0])
-def test_an_edge_met_in_turning_is_told_at_every_heading(heading: float) -> None:
+def test_an_edge_met_in_turning_is_reported_at_every_heading(heading: float) -> None:
     sensor = Sensor(Map(is_rim=True), (1.0, 2.0, heading))
     sensor.off(HALF_BASE_M * 0.01 * 1.05, turn=0.01)
     assert not sensor.episode.is_from_turn
 
 
-def test_on_and_the_way_back_from_an_edge_are_told() -> None:
+def test_on_and_the_way_back_from_an_edge_are_reported() -> None:
     sensor = Sensor(Map(is_rim=True))
     sensor.off(0.001)
     assert sensor.off(0.001)

@@ -121,7 +121,7 @@ def test_without_a_sample_before_nothing_is_known_of_its_way(rule: Rule) -> None
 
 
 @pytest.mark.parametrize("omega", [0.5, -0.5])
-def test_turning_in_place_is_told_by_half_the_wheel_base(rule: Rule, omega: float) -> None:
+def test_turning_in_place_is_recognized_by_half_the_wheel_base(rule: Rule, omega: float) -> None:
     half_m = 0.5 * rule.cfg.robot.wheel_base_m
     for share, is_turn in ((0.95, True), (1.05, False)):
         one = Rule(rule.cfg)

@@ -22,7 +22,7 @@ def test_samples_with_possible_times_are_the_same_object(offset_s: float) -> Non
 
 
 @pytest.mark.parametrize("offset_s", [-5.0, -1.001, 0.0011, 0.4, 5.0, inf, -inf, nan])
-def test_only_the_sample_with_an_impossible_time_is_left_out(offset_s: float) -> None:
+def test_only_the_sample_with_an_impossible_time_is_not_used(offset_s: float) -> None:
     samples = [WheelSample(t, 1.0, 1.0) for t in (4.98, 5.0 + offset_s, 5.0)]
     assert possible_samples(5.0, samples) == [samples[0], samples[2]]
 

@@ -48,7 +48,7 @@ def test_of_every_pair_of_conditions_each_keeps_its_denial_its_severity_and_its_
             assert (both.code, both.seq, both.t_s) == (before.code, before.seq, before.t_s), what
 
 
-def test_a_latch_keeps_the_highest_severity_and_full_fans_of_two_findings_and_of_equal_ones_the_first() -> None:
+def test_a_latch_keeps_the_highest_severity_and_the_full_fans_of_two_findings() -> None:
     for first, second in combinations_with_replacement(DANGER, 2):
         for a, b in ((first, second), (second, first)):
             latch = FindingLatch(1.0)

@@ -332,7 +332,7 @@ async def test_in_lockstep_each_fault_that_makes_sense_there(
     assert record["samples"] > 0
 
 
-async def test_a_fault_that_never_began_says_so() -> None:
+async def test_a_fault_that_never_began_is_reported() -> None:
     client, log = await drive('[[link]]\ntype = "reset"\nat_s = 99.0', reached(20), lockstep=True)
     assert not client.lost
     assert log.of("begins") == []

@@ -192,7 +192,7 @@ def field(cfg: CricketConfig, places: list[list[float]], facings: list[list[floa
     return MoteField(cfg, motes, np.random.default_rng(1))
 
 
-def heard(cfg: CricketConfig, repeats: int = 1, distance_m: float = 5.0) -> MotePulse:
+def received(cfg: CricketConfig, repeats: int = 1, distance_m: float = 5.0) -> MotePulse:
     (reading,) = field(cfg, [[0.0, 0.0], [distance_m, 0.0]]).listen([(0, 1)], repeats, np.random.default_rng(2))
     return reading
 
@@ -210,19 +210,19 @@ QUIET = {"sim__sigma_m": 0.0}
     ],
 )
 def test_flight_latency_and_clock(keys: dict[str, float], delay_s: float) -> None:
-    pulse = heard(mote_config(**QUIET, **keys))
+    pulse = received(mote_config(**QUIET, **keys))
     assert pulse.delays_s[0] == pytest.approx(delay_s)
     assert pulse.temperature_c == keys.get("sim__temperature_c", 20.0)
 
 
 def test_noise_is_that_of_the_configuration() -> None:
-    ranges_m = heard(mote_config(), 4000).delays_s * 344.0
+    ranges_m = received(mote_config(), 4000).delays_s * 344.0
     assert ranges_m.std() == pytest.approx(0.0066667, rel=0.04)  # 4000 draws: 1.1 %
     assert ranges_m.mean() == pytest.approx(5.0, abs=4e-4)
 
 
 def test_echoes_are_longer_and_losses_are_missing() -> None:
-    reading = heard(mote_config(**QUIET, sim__multipath_probability=0.25, sim__loss_probability=0.5), 4000)
+    reading = received(mote_config(**QUIET, sim__multipath_probability=0.25, sim__loss_probability=0.5), 4000)
     assert len(reading.delays_s) == pytest.approx(2000, abs=130)  # four standard deviations
     excess_m = reading.delays_s * 344.0 - 5.0
     assert excess_m.min() > -1e-9
@@ -233,8 +233,8 @@ def test_echoes_are_longer_and_losses_are_missing() -> None:
 
 def test_thermometers_have_errors_of_their_own() -> None:
     motes = field(mote_config(sim__thermometer_sigma_c=2.0), [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
-    told = [one.temperature_c for one in motes.listen([(0, 1), (0, 2), (1, 2)], 1, np.random.default_rng(2))]
-    assert told[0] != told[1] == told[2]
+    reported = [one.temperature_c for one in motes.listen([(0, 1), (0, 2), (1, 2)], 1, np.random.default_rng(2))]
+    assert reported[0] != reported[1] == reported[2]
 
 
 def test_the_usable_region() -> None:

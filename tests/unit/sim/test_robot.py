@@ -219,7 +219,7 @@ def test_truth_comes_in_batches(config: Config, mirror: Mirror, outbox: Outbox) 
     assert [row[0] for batch in batches for row in batch.rows] == list(range(251))
 
 
-def test_a_fall_is_told_at_once(config: Config, mirror: Mirror, outbox: Outbox) -> None:
+def test_a_fall_is_reported_at_once(config: Config, mirror: Mirror, outbox: Outbox) -> None:
     robot = boot(config, mirror)
     with closing(GroundTruthPublisher(robot, pub="inproc://truth")) as truth:
         while not robot.world.is_fallen:
@@ -233,11 +233,11 @@ def test_a_fall_is_told_at_once(config: Config, mirror: Mirror, outbox: Outbox) 
 def test_answers(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror)
     with closing(GroundTruthPublisher(robot)) as truth:
-        puck, told, unknown = (json.loads(truth.answer(name)) for name in (b"puck", b"misalignment", b"x" * 1000))
+        puck, reported, unknown = (json.loads(truth.answer(name)) for name in (b"puck", b"misalignment", b"x" * 1000))
     assert (puck["t"], puck["moved_m"], tuple(puck["puck"])) == (0.0, 0.0, robot.world.puck_world())
-    assert [PanelId(*row[:2]) for row in told["panels"]] == list(mirror.panels)
-    assert [list(row) for row in robot.truth_preface()[1].panels] == told["panels"]
-    assert told["start"][:2] == [robot.world.start_pose.x_m, robot.world.start_pose.y_m]
+    assert [PanelId(*row[:2]) for row in reported["panels"]] == list(mirror.panels)
+    assert [list(row) for row in robot.truth_preface()[1].panels] == reported["panels"]
+    assert reported["start"][:2] == [robot.world.start_pose.x_m, robot.world.start_pose.y_m]
     assert "unknown request" in unknown["error"]
 
 
@@ -340,7 +340,7 @@ def test_each_kind_alone_changes_what_is_its_own(config: Config, hard: Config, m
 
 def test_hello_stays_nominal(hard: Config, mirror: Mirror) -> None:
     robot = boot(hard, mirror)
-    told = robot.hello(boot=1, nonce="0" * 32, auth="none", lockstep=True).robot
-    assert (told.wheel_radius_m, told.wheel_base_m) == (hard.robot.wheel_radius_m, hard.robot.wheel_base_m)
+    reported = robot.hello(boot=1, nonce="0" * 32, auth="none", lockstep=True).robot
+    assert (reported.wheel_radius_m, reported.wheel_base_m) == (hard.robot.wheel_radius_m, hard.robot.wheel_base_m)
     assert robot.world.wheels.base_m != hard.robot.wheel_base_m
     assert robot.world.plant.lag_s != hard.sim.robot.wheel_lag_s

@@ -100,7 +100,7 @@ def test_a_mistake_is_one_line_with_its_place(text: str, message: str) -> None:
     assert all("\n" not in problem for problem in caught.value.problems)
 
 
-def test_every_mistake_is_told() -> None:
+def test_every_mistake_is_reported() -> None:
     with pytest.raises(ConfigError, match=r"\(and 2 more") as caught:
         parse_plan(FAULT + 'type = "off"\na = 1\nb = 2\n' + LINK + 'type = "x"', "plan")
     assert len(caught.value.problems) == 3
@@ -159,7 +159,7 @@ def acted(robot: Robot) -> tuple[float | None, float | None, int, int]:
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_a_blocked_wheel_stands_and_its_encoder_says_so(config: Config, mirror: Mirror, side: str) -> None:
+def test_a_blocked_wheel_stands_and_its_encoder_reports_it(config: Config, mirror: Mirror, side: str) -> None:
     robot = boot(config, mirror, signal=f"{side}_wheel", type="blocked", for_s=0.5)
     frames = drive(robot, 3.0, 3.0, 0.9)
     column, other = (1, 2) if side == "right" else (2, 1)
@@ -345,8 +345,8 @@ def test_a_reboot_with_late_sensors_delivers_nothing_of_the_boot_before() -> Non
 def test_news_tell_each_beginning_and_end_once(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror, signal="imu_wz", type="off", for_s=0.2)
     assert robot.injector is not None
-    heard = []
+    received = []
     for _ in range(100):
         robot.advance()
-        heard += [(what, robot.seq, injected.samples) for what, injected in robot.injector.changes(robot.t_s)]
-    assert heard == [("begins", 50, 1), ("ended", 70, 20)]
+        received += [(what, robot.seq, injected.samples) for what, injected in robot.injector.changes(robot.t_s)]
+    assert received == [("begins", 50, 1), ("ended", 70, 20)]

@@ -169,7 +169,7 @@ def test_the_table_knows_every_type_and_signal() -> None:
 
 @pytest.mark.parametrize("kind", TABLE)
 @pytest.mark.parametrize("signal", SENSOR_SIGNALS)
-def test_a_fault_acts_and_says_so(config: Config, mirror: Mirror, sound: Drive, signal: str, kind: str) -> None:
+def test_a_fault_acts_and_reports_it(config: Config, mirror: Mirror, sound: Drive, signal: str, kind: str) -> None:
     values, check = TABLE[kind]
     if (signal, kind) == ("fans", "stuck"):
         values = {"value": 1.0}

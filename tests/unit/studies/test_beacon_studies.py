@@ -70,7 +70,7 @@ def test_more_updates_change_little_and_the_printed_prior_makes_it_worse(cells: 
     assert prior["rms_m"]["p50"] > 1.5 * max(prior["phase1_rms_m"], cell.values["rms_m"]["p50"])
 
 
-def test_without_a_plan_the_filter_goes_on_from_the_batch() -> None:
+def test_without_a_plan_the_filter_continues_from_the_batch() -> None:
     """Of 40 motes 25 cannot be trilaterated one after the other; what may be mirrored is known."""
     keys = {"system": "cricket", "cricket.layout": "random", "cricket.random.count": 40}
     cfg = load_radio_config(

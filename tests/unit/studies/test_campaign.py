@@ -353,8 +353,8 @@ def test_what_cannot_be_is_one_line(
 ) -> None:  # fmt: skip
     (tmp_path / "file").touch()
     (tmp_path / "taken" / "table.md").mkdir(parents=True)
-    told = refused(capsys, "study", name, "--out", tmp_path / out, *args, status=status)
-    assert told == message.format(out=tmp_path / out) + "\n"
+    reported = refused(capsys, "study", name, "--out", tmp_path / out, *args, status=status)
+    assert reported == message.format(out=tmp_path / out) + "\n"
 
 
 @pytest.mark.parametrize("name", ["one", "toy"])
@@ -364,8 +364,8 @@ def test_what_cannot_be_drawn_is_one_line_before_any_work(
 ) -> None:
     for module in ("matplotlib", "matplotlib.figure"):
         monkeypatch.setitem(sys.modules, module, None)
-    told = refused(capsys, "study", name, "--out", tmp_path / "out")
-    assert told.startswith("ccatp: the package matplotlib")
+    reported = refused(capsys, "study", name, "--out", tmp_path / "out")
+    assert reported.startswith("ccatp: the package matplotlib")
     assert not list((tmp_path / "out").iterdir())
 
 

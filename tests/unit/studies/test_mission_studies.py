@@ -271,7 +271,7 @@ def test_fans_that_seem_to_fail_on_an_overhang_wait_for_an_operator(signal: str,
     assert is_recoverable(plan, build_mirror(load_config(None, {"run.mirror": mirror}).mirror)) is is_so
 
 
-def test_a_cell_says_who_was_not_completed() -> None:
+def test_a_cell_names_the_missions_that_are_not_complete() -> None:
     injected: Any = {"injected": {"planned": 12, "acted": 11}}
     ended: Any = {"is_recoverable": False, "weak_frames": 4, "outcome": "stopped", "cause": "held"}
     whole = mission([0.001], seed=1, is_recoverable=True, weak_frames=0, **injected)

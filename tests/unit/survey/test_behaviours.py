@@ -52,7 +52,9 @@ def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> StateEstimate:
     return StateEstimate(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
 
 
-def test_asks_once_and_only_after_the_measuring_time_at_rest(settling: Standing, mirror: Mirror) -> None:
+def test_a_measurement_is_requested_once_and_after_the_measuring_time_at_rest(
+    settling: Standing, mirror: Mirror
+) -> None:
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
     asked = [k for k in range(settled, settled + 200) if settling.is_due(at(mirror, k))]
     assert asked == [settled + round(MEASURING_S / DT)]
@@ -60,7 +62,7 @@ def test_asks_once_and_only_after_the_measuring_time_at_rest(settling: Standing,
 
 
 @pytest.mark.fault("E9")
-def test_who_moves_for_ever_is_never_measured_and_restless(settling: Standing, mirror: Mirror) -> None:
+def test_a_robot_that_keeps_moving_is_not_measured_and_exceeds_its_limit(settling: Standing, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
     frames = range(settled + 1, settled + 2000)
     assert [k for k in frames if settling.is_due(at(mirror, k, speed_m_s=0.01))] == []
@@ -357,7 +359,7 @@ def test_a_slope_that_differs_by_more_than_5_deg_never_passes(name: str) -> None
             assert not check(mirror, tilted(mirror, mirror.base_pose, by_deg, 0.4 * seed), seed).contradiction, by_deg
 
 
-def test_a_robot_without_the_sensor_is_waited_for_and_told() -> None:
+def test_a_robot_without_the_sensor_is_waited_for_and_reported() -> None:
     found = MirrorCheck(mirror_of("fyst-m1"))
     pose = mirror_of("fyst-m1").base_pose
     assert not found.update(10.0, None, pose)
@@ -433,7 +435,7 @@ DRIVE = (
     ("place", "expected"),
     [((0.0, 0.05), True), ((0.02, 0.11), True), ((0.0, -0.02), True), ((0.04, 0.05), False), ((0.0, 0.14), False)],
 )
-def test_near_its_line_the_drive_goes_on(place: tuple[float, float], expected: bool) -> None:
+def test_near_its_line_the_drive_continues(place: tuple[float, float], expected: bool) -> None:
     assert is_on_drive(DRIVE, *place) is expected
     assert not is_on_drive(DRIVE[-1:], *place)
 

@@ -110,7 +110,7 @@ def test_a_pinned_map_has_the_errors_of_its_frame() -> None:
     assert np.sqrt(sample.diagonal()[free]) == pytest.approx(np.sqrt(covariance.diagonal()[free]), rel=0.2)
 
 
-def test_a_frame_wants_three_coordinates() -> None:
+def test_a_frame_needs_three_coordinates() -> None:
     with pytest.raises(ValueError, match="4 known coordinates, wanted both of one mote and one of another"):
         pinned_map(HEADS, np.eye(12), np.where(np.arange(6)[:, None] < 2, HEADS, np.nan))
 
@@ -155,7 +155,7 @@ def test_derivatives_of_everything(dimension: int) -> None:
         assert J[:, column] == pytest.approx(slope, abs=1e-7)
 
 
-def test_too_few_steps_are_told() -> None:
+def test_too_few_steps_are_reported() -> None:
     model = MapModel(network_of(HEADS, ALL))
     fit = fit_map(
         model, model.state(HEADS + np.random.default_rng(1).normal(size=(6, 2))), MapFitSettings(max_iterations=2)
@@ -327,7 +327,7 @@ def test_a_single_mote_on_the_wrong_side_is_turned_over() -> None:
     assert mended.cost == pytest.approx(right.cost, rel=1e-6)
 
 
-def test_a_mote_that_two_ranges_hold_is_told_to_be_doubtful() -> None:
+def test_a_mote_with_two_ranges_is_reported_as_uncertain() -> None:
     network = network_of(HEADS, [pair for pair in ALL if 5 not in pair] + [(3, 5), (4, 5)])
     model = MapModel(network)
     _, _, doubtful = unfold(model, fit_map(model, model.state(HEADS), ROBUST), ROBUST)

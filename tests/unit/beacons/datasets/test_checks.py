@@ -131,9 +131,9 @@ def test_a_sound_run_raises_no_suspicion() -> None:
 
 @pytest.mark.parametrize(("run", "what", "unsaid"), WRONG, ids=[what for _, what, _ in WRONG])
 def test_what_looks_wrong_is_reported_and_nothing_else(run: RecordedRun, what: str, unsaid: str) -> None:
-    told = " | ".join(suspicions(run))
-    assert what in told
-    assert unsaid not in told
+    reported = " | ".join(suspicions(run))
+    assert what in reported
+    assert unsaid not in reported
 
 
 @pytest.mark.parametrize(("turned", "what"), [(np.pi, "pi"), (-1.2, "-1.200 rad")])
@@ -164,9 +164,9 @@ def test_a_truth_that_begins_after_the_odometry(tmp_path: Path) -> None:
 )
 def test_labyrinth_wheel_columns_by_the_true_path(tmp_path: Path, exchanged: bool, what: str) -> None:
     run = read_run(write_lines(tmp_path / "a.txt", labyrinth_lines(W, exchanged=exchanged)), None, None)
-    told = " | ".join(run.warnings)
-    assert what in told
-    assert ("turns the other way" in told) is exchanged
+    reported = " | ".join(run.warnings)
+    assert what in reported
+    assert ("turns the other way" in reported) is exchanged
 
 
 TURN = np.array([[0.8, -0.6], [0.6, 0.8]])
@@ -191,7 +191,7 @@ def mapped(names: str = "6789", sigma_m: float = 0.05) -> EstimatedPath:
         ({"6": (3.0, 9.0), "7": (0.0, -3.0)}, "are expected: one of them is wrong"),  # neither makes it fit
     ],
 )
-def test_a_map_tells_what_is_wrong_with_the_survey(survey: dict[str, tuple[float, float]], what: str) -> None:
+def test_a_map_shows_errors_of_the_survey(survey: dict[str, tuple[float, float]], what: str) -> None:
     lines = survey_doubts(mapped(), {**BEACONS, **survey})
     assert len(lines) == bool(what)
     assert what in " ".join(lines)

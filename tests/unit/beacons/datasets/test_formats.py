@@ -106,9 +106,9 @@ def test_without_truth_a_run_begins_at_the_origin(form: str, truth: str, survey:
     run = read_run(folder, None, None)
     assert (run.truth, run.first_pose, dict(run.beacon_truth_m)) == (None, (0.0, 0.0, 0.0), {})
     assert len(run.steps.times_s) == len(run.steps.distance_m) + 1
-    told = " | ".join(run.warnings)
-    assert "no reference trajectory" in told
-    assert ("no Landmark_Groundtruth.dat" in told) == (form == "mrclam")
+    reported = " | ".join(run.warnings)
+    assert "no reference trajectory" in reported
+    assert ("no Landmark_Groundtruth.dat" in reported) == (form == "mrclam")
 
 
 def test_mrclam_takes_the_robot_asked_for_and_leaves_out_robots_and_strangers(tmp_path: Path) -> None:
@@ -157,13 +157,13 @@ def test_rows_out_of_order_doubled_or_not_finite_are_mended_and_told(tmp_path: P
     seen.write_text("\n".join([*head, *rows]), encoding="utf-8")
     run = read_run(tmp_path, None, None)
     check(run, W, bearings=True)
-    told = " | ".join(run.warnings)
-    assert "Robot1_Measurement.dat:14: time goes back 1 time" in told
-    assert "Robot1_Measurement.dat:53: 1 row doubled" in told
-    assert "Robot1_Measurement.dat:103: 1 row not finite" in told
+    reported = " | ".join(run.warnings)
+    assert "Robot1_Measurement.dat:14: time goes back 1 time" in reported
+    assert "Robot1_Measurement.dat:53: 1 row doubled" in reported
+    assert "Robot1_Measurement.dat:103: 1 row not finite" in reported
 
 
-def test_readings_beyond_the_odometry_are_left_out_and_told(tmp_path: Path) -> None:
+def test_readings_beyond_the_odometry_are_not_used_and_reported(tmp_path: Path) -> None:
     tables = plaza_tables(W)
     early = np.array([[-5.0, 2.0, 6.0, 3.0]])
     write_plaza(tmp_path, W, mat=False)
@@ -173,7 +173,7 @@ def test_readings_beyond_the_odometry_are_left_out_and_told(tmp_path: Path) -> N
     assert any("1 range before the first or after the last odometry" in warning for warning in run.warnings)
 
 
-def test_csv_with_a_truth_that_lacks_some_headings_is_told(tmp_path: Path) -> None:
+def test_csv_with_a_truth_that_lacks_some_headings_is_reported(tmp_path: Path) -> None:
     lines = csv_lines(W)
     row = next(k for k, line in enumerate(lines) if line.startswith("truth,5.0,"))
     lines[row] = lines[row].rsplit(",", 1)[0]
@@ -203,7 +203,7 @@ def steps_of(distance_m: FloatArray, turn_rad: FloatArray, interval_s: float = 0
     return Steps(interval_s * np.arange(distance_m.size + 1.0), distance_m, turn_rad, np.zeros(distance_m.size))
 
 
-def test_a_row_that_is_lost_goes_on_as_before() -> None:
+def test_a_row_that_is_lost_continues_as_before() -> None:
     rng = np.random.default_rng(1)
     distance: FloatArray = 0.05 + 0.001 * rng.standard_normal(1000)
     distance[400] = np.nan
@@ -387,9 +387,9 @@ FAULTS: list[tuple[Make, str | None, str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("make", "data_format", "told"), FAULTS, ids=[told for _, _, told in FAULTS])
-def test_a_fault_is_one_line(tmp_path: Path, make: Make, data_format: str | None, told: str) -> None:
-    with pytest.raises(RadioDataError, match=told) as caught:
+@pytest.mark.parametrize(("make", "data_format", "reported"), FAULTS, ids=[reported for _, _, reported in FAULTS])
+def test_a_fault_is_one_line(tmp_path: Path, make: Make, data_format: str | None, reported: str) -> None:
+    with pytest.raises(RadioDataError, match=reported) as caught:
         read_run(make(tmp_path), data_format, None)
     assert "\n" not in str(caught.value)
     assert caught.value.exit_status == ExitStatus.USAGE
@@ -403,21 +403,21 @@ def test_a_robot_that_is_not_there(tmp_path: Path) -> None:
         read_run(write_plaza(tmp_path, W_SHORT), None, 1)
 
 
-def test_readings_that_cannot_be_are_left_out(tmp_path: Path) -> None:
+def test_readings_that_cannot_be_are_not_used(tmp_path: Path) -> None:
     lines = ["range,1.01,6,1e200", "rssi,1.02,6,-1e9", "bearing,1.03,6,inf", "range,1.04,7,2.5", "bearing,1.04,7,1e9"]
     lines.append("range,1.05,6,0")
     run = read_run(write_lines(tmp_path / "mine.csv", [*csv_lines(W_SHORT), *lines, "beacon,far,1e200,0"]), None, None)
     assert len(run.readings.times_s) == len(W_SHORT.read_s) + 1
     assert "far" not in run.beacon_truth_m
-    told = " ".join(run.warnings)
-    assert "1 range beyond 1e+06 m, the first 1e+200 m at 1.01 s" in told
+    reported = " ".join(run.warnings)
+    assert "1 range beyond 1e+06 m, the first 1e+200 m at 1.01 s" in reported
     for words in (
         "1 range of 0 m, the first at 1.05 s",
         "1 signal strength beyond",
         "1 bearing beyond",
         "surveyed place of far: is no place",
     ):
-        assert words in told
+        assert words in reported
 
 
 def small(*lines: str) -> list[str]:

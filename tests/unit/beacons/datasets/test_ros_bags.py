@@ -131,9 +131,9 @@ def test_an_antenna_off_the_origin_and_beacons_at_a_height(tmp_path: Path) -> No
     noise = np.random.default_rng(2).normal(0.0, 0.05, len(at))
     w = replace(w, range_m=np.hypot(np.hypot(*(places - at).T), ABOVE_M) + noise)
     lines = [line for line in csv_lines(w) if not line.startswith("bearing")]
-    told = [f"{line},{ABOVE_M + 0.3}" if line.startswith("beacon") else line for line in lines]
+    reported = [f"{line},{ABOVE_M + 0.3}" if line.startswith("beacon") else line for line in lines]
     cfg, errors_m = load_recordings_config(), []
-    for name, text in (("told", [*told, f"antenna,{ahead},{left},0.3"]), ("untold", lines)):
+    for name, text in (("reported", [*reported, f"antenna,{ahead},{left},0.3"]), ("untold", lines)):
         run = read_run(write_lines(tmp_path / f"{name}.csv", text), None, None)
         errors_m.append(judge(filter_run(run, cfg.csv, cfg.filter, perf_counter), run).beacon_rmse_m or np.inf)
     assert errors_m[0] < 0.1  # two sigmas of a range

@@ -139,11 +139,11 @@ REFUSALS: list[tuple[Callable[[Path], object], str, str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("read", "content", "told"), REFUSALS, ids=[told for _, _, told in REFUSALS])
+@pytest.mark.parametrize(("read", "content", "reported"), REFUSALS, ids=[reported for _, _, reported in REFUSALS])
 def test_what_cannot_be_used_is_refused(
-    read: Callable[[Path], object], content: str, told: str, tmp_path: Path
+    read: Callable[[Path], object], content: str, reported: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(RadioDataError, match=told):
+    with pytest.raises(RadioDataError, match=reported):
         read(text(tmp_path, content))
 
 

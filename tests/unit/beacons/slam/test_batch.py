@@ -284,9 +284,9 @@ def test_signal_strengths_alone_place_beacons() -> None:
     w = world(7, 120.0, range_sigma_m=0.0)
     rssi = -43.0 - 10.0 * 2.1 * np.log10(w.range_m) + 2.0 * rng.standard_normal(w.range_m.size)
     nothing = np.full(rssi.size, np.nan)
-    heard = replace(run, readings=run.readings._replace(range_m=nothing, rssi_dbm=rssi))
-    track = smooth(heard, SETTINGS, HOW, no_clock)
-    judged = judge(track, heard)
+    received = replace(run, readings=run.readings._replace(range_m=nothing, rssi_dbm=rssi))
+    track = smooth(received, SETTINGS, HOW, no_clock)
+    judged = judge(track, received)
     assert judged.beacon_rmse_m == pytest.approx(0.0, abs=0.6)  # 2 dB are a quarter of the distance
     assert set(track.calibration) >= {"rssi_reference_db", "rssi_exponent"}
     assert "range_scale" not in track.calibration
@@ -414,7 +414,7 @@ def test_without_a_true_path_the_beacons_are_aligned_themselves() -> None:
 RNG = np.random.default_rng(3)
 
 
-def test_a_mirror_image_is_another_map_unless_told() -> None:
+def test_a_mirror_image_is_another_map_unless_excluded() -> None:
     points = RNG.normal(size=(8, 2))
     mirrored = points * (1.0, -1.0)
     assert aligned_rms_m(mirrored, points) > 0.3

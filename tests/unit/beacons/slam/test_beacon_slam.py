@@ -152,12 +152,12 @@ def test_the_delay_of_a_vehicle_that_follows_its_commands_late_is_found() -> Non
 def test_signal_strengths_with_levels_of_their_own() -> None:
     levels = {"a": -43.0, "b": -34.0}
 
-    def heard(time_s: float, world: World, beacon: BeaconId) -> Reading:
+    def received(time_s: float, world: World, beacon: BeaconId) -> Reading:
         rssi = levels[str(beacon)] - 20.0 * log10(world.range_m(beacon)) + 0.5 * world.rng.normal()
         return Reading(time_s, beacon, bearing_rad=world.bearing_rad(beacon), rssi_dbm=rssi)
 
     rssi = {"radio__rssi_sigma_db": 0.5, "radio__rssi_reference_dbm": -38.0, "radio__rssi_exponent": 2.0}
-    world = start(SETTINGS.but(**rssi, priors__rssi_reference_db=5.0), heard)
+    world = start(SETTINGS.but(**rssi, priors__rssi_reference_db=5.0), received)
     world.beacons = {beacon: BEACONS[beacon] for beacon in levels}
     # On one circle, levels of a point and of its inverse differ by a constant.
     for turn_rad in (0.05, -0.04, 0.03, -0.05):
@@ -323,10 +323,10 @@ def test_the_filter_finds_itself_again(begin_s: float, bearings: bool) -> None:
     assert found.nees.mean < 4.0
 
 
-def test_a_guessed_way_is_told_and_no_scale_of_the_odometry() -> None:
-    told = suspicions(with_gap(60.0, 15.0, bearings=False))
-    assert any("odometry: 1 gap, the longest of 15.0 s" in line and "is guessed" in line for line in told)
-    assert not any("true ways are" in line for line in told)
+def test_a_guessed_way_is_reported_and_no_scale_of_the_odometry() -> None:
+    reported = suspicions(with_gap(60.0, 15.0, bearings=False))
+    assert any("odometry: 1 gap, the longest of 15.0 s" in line and "is guessed" in line for line in reported)
+    assert not any("true ways are" in line for line in reported)
     assert np.isfinite(with_gap(60.0, 15.0, bearings=False).steps.distance_m).all()
 
 
@@ -374,7 +374,7 @@ def test_ranges_by_height_are_depths_where_a_camera_reads_them() -> None:
         assert residuals == pytest.approx(range_residuals(camera, by_distance, field_rad), abs=1e-6)
 
 
-def test_a_twentieth_of_the_readings_refused_is_told() -> None:
+def test_a_twentieth_of_the_readings_refused_is_reported() -> None:
     run = recorded(world(3, 120.0))
     for every, is_told in ((200, False), (12, True)):
         far = np.arange(run.readings.range_m.size) % every == every - 1
@@ -427,7 +427,7 @@ def test_the_map_of_a_fixed_lag_fits_all_that_is_kept_in_the_frame_of_its_path()
     assert forgetful.beacons[one][:2] == pytest.approx(of_filter[:2])
 
 
-def test_a_calibration_that_no_reading_told_is_not_told() -> None:
+def test_a_calibration_that_no_reading_determines_is_not_reported() -> None:
     run = recorded(world(3, 30.0), bearings=False)
     few = replace(run, readings=run.readings.where(run.readings.times_s < 1.0))
     track = filter_run(few, CONFIG.csv, CONFIG.filter, no_clock)
@@ -438,10 +438,10 @@ def test_a_calibration_that_no_reading_told_is_not_told() -> None:
     assert not {"range_scale", "range_offset_m"} & {*data["calibration"]}
 
 
-def test_a_value_that_its_prior_excludes_is_told_with_the_key() -> None:
+def test_a_value_that_its_prior_excludes_is_reported_with_the_key() -> None:
     run = recorded(world(3, 60.0))
     long = replace(run, truth=None, readings=run.readings._replace(range_m=1.4 * run.readings.range_m))
     for track, sound in zip(by_both(long), by_both(run), strict=True):
-        (told,) = [w for w in track.warnings if w.startswith("range_scale comes out as")]
-        assert "widen csv.priors.range_scale (now 0.05)" in told
+        (reported,) = [w for w in track.warnings if w.startswith("range_scale comes out as")]
+        assert "widen csv.priors.range_scale (now 0.05)" in reported
         assert not any("comes out as" in w for w in sound.warnings)

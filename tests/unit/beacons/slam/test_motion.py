@@ -45,19 +45,19 @@ def test_an_arc_ends_where_a_circle_does() -> None:
     assert end == pytest.approx((0.0, 2.0, pi), abs=1e-12)
 
 
-def test_noise_of_a_way_does_not_depend_on_how_often_it_is_told() -> None:
+def test_noise_of_a_way_does_not_depend_on_how_often_it_is_reported() -> None:
     drive = settings(**odometry(0.05, 0.0, 0.02, 0.0, 0.01, 0.0)).drive
 
-    def told(steps: int) -> FloatArray:
+    def reported(steps: int) -> FloatArray:
         x, P = np.zeros(3), np.zeros((3, 3))
         for _ in range(steps):
             x, F, Q = drive.step(x, Increment(0.0, 4.0 / steps, 2.0 / steps, 0.0))
             P = F @ P @ F.T + Q
         return P
 
-    assert told(400) == pytest.approx(told(40), rel=1e-2, abs=1e-9)  # midpoint and limit differ by 1 / steps^2
-    assert told(40)[0, 0] == pytest.approx(0.05**2 * 2.0)
-    assert told(40)[2, 2] == pytest.approx(0.02**2 * 2.0 + 0.01**2 * 4.0)
+    assert reported(400) == pytest.approx(reported(40), rel=1e-2, abs=1e-9)  # midpoint and limit differ by 1 / steps^2
+    assert reported(40)[0, 0] == pytest.approx(0.05**2 * 2.0)
+    assert reported(40)[2, 2] == pytest.approx(0.02**2 * 2.0 + 0.01**2 * 4.0)
 
 
 def test_a_turn_at_rest_is_the_bias_and_turns_nothing() -> None:
@@ -120,19 +120,19 @@ def test_bearings_of_times_of_their_own_are_used_once_their_beacon_is_placed() -
     assert any("bearings had no range or strength of the same time and came before" in w for w in track.warnings)
 
 
-def test_a_beacon_of_which_only_bearings_were_heard_is_told_so() -> None:
+def test_a_beacon_with_bearings_only_is_reported_as_such() -> None:
     run = recorded(world(3, 20.0))
     blind = run.readings._replace(range_m=np.full(len(run.readings.times_s), np.nan))
-    told = track_of(replace(run, readings=blind)).warnings
-    assert "beacon 6 could not be placed: only bearings of it were received, no range" in told
+    reported = track_of(replace(run, readings=blind)).warnings
+    assert "beacon 6 could not be placed: only bearings of it were received, no range" in reported
 
 
-def test_beacons_that_are_exchanged_on_the_way_are_told() -> None:
+def test_beacons_that_are_exchanged_on_the_way_are_reported() -> None:
     run = recorded(world(seconds=120.0))
     swap = np.where(run.readings.times_s > 60.0, np.array([1, 0, 2, 3])[run.readings.beacon], run.readings.beacon)
-    told = track_of(replace(run, readings=run.readings._replace(beacon=swap))).warnings
+    reported = track_of(replace(run, readings=run.readings._replace(beacon=swap))).warnings
     for name in ("6", "7"):
-        assert any(w.startswith(f"beacon {name} was placed again at ") and "exchanged" in w for w in told)
+        assert any(w.startswith(f"beacon {name} was placed again at ") and "exchanged" in w for w in reported)
 
 
 SCAN = ReflectorScan(ScanConfig(readings=40, bearing_sigma_rad=radians(18.0), loss_tolerance=0.5))

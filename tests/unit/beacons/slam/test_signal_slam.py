@@ -94,7 +94,7 @@ def test_many_levels_with_one_unknown_offset_do_not_tell_the_range() -> None:
     assert sigma == pytest.approx(1.0 / np.hypot(1.0 / log(2.0), 1.0 / 0.576), rel=0.05)
 
 
-def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
+def received(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
     """Of a radio in the middle of the room, far from walls; and the error of its place."""
     slam = SignalSlam(slam_cfg)
     loss = slam.path_loss_of("b")
@@ -110,10 +110,10 @@ def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
 
 
 def test_a_new_radio_waits_and_is_on_the_map_all_the_same() -> None:
-    slam, error_m = heard(config(), 1)
+    slam, error_m = received(config(), 1)
     assert "b" not in slam.engine
     assert error_m < 0.01
-    slam, error_m = heard(config(estimator__waiting_scans=4), 5)
+    slam, error_m = received(config(estimator__waiting_scans=4), 5)
     assert "b" in slam.engine
     assert error_m < 0.02
     assert not [b for b in slam.engine.blocks if not isinstance(b, str)]
@@ -176,19 +176,19 @@ def scene(seed: int, sigma_db: float, points: int) -> tuple[LevelLocator, list[M
         distances = [max(float(np.hypot(p[0] - at[0], p[1] - at[1])), 0.1) for p in places]
         fits[name] = fit_path_loss(LevelPair(r, level(p, name), p) for r, p in zip(distances, places, strict=True))
     drawn = (draw() for _ in range(points))
-    heard = [MeasuredPlace(place, {name: level(place, name) for name in BEACONS}) for place in drawn]
-    return LevelLocator(BEACONS, fits, ROOM), heard
+    received = [MeasuredPlace(place, {name: level(place, name) for name in BEACONS}) for place in drawn]
+    return LevelLocator(BEACONS, fits, ROOM), received
 
 
 def test_ninety_per_cent_regions_hold_ninety_per_cent() -> None:
-    locator, heard = scene(2, 5.0, 300)
-    inside = np.mean([locator.fix(levels).holds(place, 0.9) for place, levels in heard])
+    locator, received = scene(2, 5.0, 300)
+    inside = np.mean([locator.fix(levels).holds(place, 0.9) for place, levels in received])
     assert inside == pytest.approx(0.9, abs=0.06)  # 3.5 sigma of 300 points
 
 
-def test_a_beacon_that_is_not_heard_is_left_out() -> None:
-    locator, heard = scene(3, 1.0, 1)
-    levels = heard[0][1]
+def test_a_beacon_that_is_not_received_is_not_used() -> None:
+    locator, received = scene(3, 1.0, 1)
+    levels = received[0][1]
     fewer = locator.fix({"A": levels["A"]})
     assert fewer.region(0.9).sum() > locator.fix(levels).region(0.9).sum()
     with pytest.raises(ValueError, match="none of the beacons A, B, C was received"):
@@ -196,9 +196,9 @@ def test_a_beacon_that_is_not_heard_is_left_out() -> None:
 
 
 def test_exchanged_names_are_found() -> None:
-    locator, heard = scene(4, 5.0, 12)
-    assert likeliest_names(locator, heard) == ({"A": "A", "B": "B", "C": "C"}, 0.0)
-    exchanged = [one.renamed({"B": "C", "C": "B"}) for one in heard]
+    locator, received = scene(4, 5.0, 12)
+    assert likeliest_names(locator, received) == ({"A": "A", "B": "B", "C": "C"}, 0.0)
+    exchanged = [one.renamed({"B": "C", "C": "B"}) for one in received]
     names, gain = likeliest_names(locator, exchanged)
     assert names == {"A": "A", "B": "C", "C": "B"}
     assert gain > 7.0
@@ -244,15 +244,15 @@ def test_repeated_readings_tell_white_from_static() -> None:
     assert fit.sigma_db == pytest.approx(once.sigma_db, rel=0.3)  # thirty readings of a place are one witness
 
 
-def test_doubts_are_told() -> None:
+def test_doubts_are_reported() -> None:
     good = drawn(1, 12, 1, 0.5, 0.0)
     assert fit_path_loss(good).doubts() == []
     off = [*good[:-1], LevelPair(good[-1].distance_m, good[-1].level_dbm + 20.0)]
     flat = [LevelPair(d, -60.0 - 0.5 * d) for d in (1.0, 2.0, 3.0, 4.0)]
     far = [LevelPair(100.0 * pair.distance_m, pair.level_dbm) for pair in good]
     line = [LevelPair(r, -40.0 - 20.0 * np.log10(r)) for r in (1.0, 2.0, 4.0, 8.0)]
-    told = ("off the line", "is outside 1 to 6", "is above -10 dBm", "on a line exactly")
-    for pairs, what in zip((off, flat, far, line), told, strict=True):
+    reported = ("off the line", "is outside 1 to 6", "is above -10 dBm", "on a line exactly")
+    for pairs, what in zip((off, flat, far, line), reported, strict=True):
         assert any(what in doubt for doubt in fit_path_loss(pairs).doubts())
 
 

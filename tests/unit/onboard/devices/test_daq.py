@@ -311,7 +311,7 @@ def test_what_is_unknown_is_counted_and_samples_count_after_the_identity(rig: Ri
     assert "it does not answer" in second.fault(rig.time.now_s)
 
 
-def test_a_device_that_says_nothing_gets_its_port_opened_again_each_5_s(rig: Rig) -> None:
+def test_a_device_that_reports_nothing_gets_its_port_opened_again_each_5_s(rig: Rig) -> None:
     rig.device.is_mute = True
     rig.run(60.0)
     assert 8 <= rig.device.opened <= 13

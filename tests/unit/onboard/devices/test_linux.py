@@ -216,7 +216,7 @@ class _Sometimes:
 
 
 @pytest.mark.parametrize(("broken", "device", "is_found", "advice"), CHECKS.values(), ids=CHECKS)
-def test_check_says_what_is_wrong(rig: Rig, broken: Break, device: str, is_found: bool, advice: str) -> None:
+def test_check_names_what_is_wrong(rig: Rig, broken: Break, device: str, is_found: bool, advice: str) -> None:
     broken(rig)
     checks = {check.device: check for check in rig.linux.check(1.0)}
     assert list(checks) == DEVICES
