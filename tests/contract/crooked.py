@@ -26,24 +26,24 @@ Message = dict[str, Any]
 TIMEOUT_S = 1.0
 
 
-class Crooked(NamedTuple):
-    """One broken server.
+class Defect(NamedTuple):
+    """A defect that a server of the robot link is given.
 
     Attributes:
         name: what is wrong with it.
-        fails: the checks that have to find it, parted by blanks; all others of ``runs`` have to pass.
+        fails: the checks that have to find it, separated by blanks; all others of ``runs`` have to pass.
         runs: the checks that run.
-        says: changes a message of the robot; returns it, bytes of its own, or nothing.
-        hears: changes what a client sent, as it came.
-        twist: changes the robot or its link before the first connection.
+        sends: changes a message of the robot; returns it, bytes of its own, or nothing.
+        receives: changes what a client sent, as it came.
+        modify: changes the robot or its link before the first connection.
     """
 
     name: str
     fails: str = ""
     runs: tuple[str, ...] = ()
-    says: Callable[[Message, "Middle"], Message | bytes | None] | None = None
-    hears: Callable[[bytes, "Middle"], bytes] | None = None
-    twist: Callable[[SurveyLoop], object] | None = None
+    sends: Callable[[Message, "Middle"], Message | bytes | None] | None = None
+    receives: Callable[[bytes, "Middle"], bytes] | None = None
+    modify: Callable[[SurveyLoop], object] | None = None
 
 
 class Middle(Connection):
@@ -56,33 +56,33 @@ class Middle(Connection):
         has_sent: whether the client has sent what a broken server waits for.
     """
 
-    def __init__(self, owner: "CrookedLoop") -> None:
+    def __init__(self, owner: "BrokenLoop") -> None:
         super().__init__(owner)
-        self.owner, self._crooked = owner, owner.crooked
+        self.owner, self._broken = owner, owner.broken
         self.hello: Message = {}
         self.count = 0
         self.has_sent = False
 
     def write(self, data: bytes) -> None:
-        if self._crooked.says is None and self.hello:
+        if self._broken.sends is None and self.hello:
             super().write(data)
             return
         message = json.loads(data)
         self.count += 1
         if message["type"] == "hello":
             self.hello = message
-        said = message if self._crooked.says is None else self._crooked.says(message, self)
+        said = message if self._broken.sends is None else self._broken.sends(message, self)
         if said is not None:
             super().write(said if isinstance(said, bytes) else json.dumps(said).encode() + b"\n")
 
     def data_received(self, data: bytes) -> None:
-        super().data_received(data if self._crooked.hears is None else self._crooked.hears(data, self))
+        super().data_received(data if self._broken.receives is None else self._broken.receives(data, self))
 
 
-class CrookedLoop(SurveyLoop):
+class BrokenLoop(SurveyLoop):
     """A server whose messages are changed on their way."""
 
-    crooked: Crooked
+    broken: Defect
     port: int
     clock: "OneThreadLoop"
 
@@ -134,18 +134,18 @@ class OneThreadLoop(VirtualLoop):
         self.run_until_complete(asyncio.sleep(wait_s))
 
 
-HONEST = Crooked("honest")
+CORRECT = Defect("correct")
 
 
 def of(kind: str, change: Callable[[Message, Middle], object]) -> Callable[[Message, Middle], Message]:
     """Change messages of one type in place."""
 
-    def says(message: Message, middle: Middle) -> Message:
+    def sent(message: Message, middle: Middle) -> Message:
         if message["type"] == kind:
             change(message, middle)
         return message
 
-    return says
+    return sent
 
 
 def put(kind: str, **values: Any) -> Callable[[Message, Middle], Message]:
@@ -161,12 +161,12 @@ def each(change: Callable[[Message], object]) -> Callable[[Message, Middle], Mes
 def clock(change: Callable[[float], float]) -> Callable[[Message, Middle], Message]:
     """Another clock, in frames and their samples."""
 
-    def says(frame: Message) -> None:
+    def sent(frame: Message) -> None:
         frame["t"] = change(frame["t"])
         for sample in (*frame["imu"], *frame["enc"], *frame["edge"], *([frame["gravity"]] if frame["gravity"] else ())):
             sample[0] = change(sample[0])
 
-    return each(says)
+    return each(sent)
 
 
 def swap(old: bytes, new: bytes) -> Callable[[bytes, Middle], bytes]:
@@ -177,28 +177,28 @@ def swap(old: bytes, new: bytes) -> Callable[[bytes, Middle], bytes]:
 def rules(**methods: Any) -> Callable[[SurveyLoop], None]:
     """Other rules of motion, by method."""
 
-    def twist(loop: SurveyLoop) -> None:
+    def modified(loop: SurveyLoop) -> None:
         loop.robot.rules.__class__ = type("Other", (MotionRules,), methods)
 
-    return twist
+    return modified
 
 
 def around(path: str, new: Callable[..., Any]) -> Callable[[SurveyLoop], None]:
     """A method of the robot or its server (no dot), replaced by ``new(loop, method, *arguments)``."""
 
-    def twist(loop: SurveyLoop) -> None:
+    def modified(loop: SurveyLoop) -> None:
         *parts, name = path.split(".")
         owner = getattr(loop, *parts) if parts else loop
         method = getattr(owner, name)
         setattr(owner, name, lambda *args, **kwargs: new(loop, method, *args, **kwargs))
 
-    return twist
+    return modified
 
 
 @contextmanager
 def serving(
-    config: Config, *, lockstep: bool, key: bytes | None = None, crooked: Crooked = HONEST
-) -> Iterator[CrookedLoop]:
+    config: Config, *, lockstep: bool, key: bytes | None = None, broken: Defect = CORRECT
+) -> Iterator[BrokenLoop]:
     """A server whose time passes while the checks wait."""
     with asyncio.Runner(loop_factory=OneThreadLoop) as runner, ExitStack() as stack:
         loop = runner.get_loop()
@@ -209,11 +209,11 @@ def serving(
             (server_checks, "time", now), (command_checks, "time", now),
         ):  # fmt: skip
             stack.enter_context(patch.object(module, name, value))
-        server = CrookedLoop(config, lockstep=lockstep, key=key)
-        server.crooked, server.clock, stop = crooked, loop, asyncio.Event()
+        server = BrokenLoop(config, lockstep=lockstep, key=key)
+        server.broken, server.clock, stop = broken, loop, asyncio.Event()
         server.port = loop.run_until_complete(server.start())
-        if crooked.twist is not None:
-            crooked.twist(server)
+        if broken.modify is not None:
+            broken.modify(server)
         running = loop.create_task(server.run(stop))
         try:
             yield server
@@ -228,10 +228,10 @@ def checked(
     *,
     lockstep: bool,
     key: bytes | None = None,
-    crooked: Crooked = HONEST,
+    broken: Defect = CORRECT,
     mirror: Mirror | None = None,
     motion: bool = True,
 ) -> list[Result]:
     """Results of the checks on such a server."""
-    with serving(config, lockstep=lockstep, key=key, crooked=crooked) as server:
+    with serving(config, lockstep=lockstep, key=key, broken=broken) as server:
         return Conformance(("127.0.0.1", server.port), key, TIMEOUT_S, mirror).run(motion=motion, only=tuple(only))

@@ -27,7 +27,7 @@ from ccatp.commissioning.conformance.runner import CHECKS, Conformance, check_id
 from ccatp.commissioning.conformance.server_checks import check_clock, check_edges, check_gravity, line_fault
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
-from tests.contract.crooked import HONEST, TIMEOUT_S, Crooked, Middle, checked, clock, serving
+from tests.contract.crooked import CORRECT, TIMEOUT_S, Defect, Middle, checked, clock, serving
 from tests.faults.table import conformance_rows, load_table
 from tests.support.command import refused
 from tests.support.scenario import config_of, mirror_of
@@ -42,7 +42,7 @@ class Served(NamedTuple):
     config: Config
     key: bytes | None = None
     mirror: Mirror | None = None
-    crooked: Crooked = HONEST
+    broken: Defect = CORRECT
 
 
 def expected(lockstep: bool, robot: Served) -> set[str]:
@@ -64,7 +64,7 @@ OLD = config_of(**RATES, run__world="hard", world__sensors_delay_s=0.12)  # type
 
 
 def keep_all_promises(lockstep: bool, robot: Served) -> None:
-    results = checked(robot.config, lockstep=lockstep, key=robot.key, crooked=robot.crooked, mirror=robot.mirror)
+    results = checked(robot.config, lockstep=lockstep, key=robot.key, broken=robot.broken, mirror=robot.mirror)
     assert [result.check_id for result in results] == list(check_ids())
     assert [result for result in results if result.outcome == "fail"] == []
     not_applicable = {result.check_id for result in results if result.outcome == "not applicable"}
@@ -80,8 +80,8 @@ def test_our_robots(robot: Served, lockstep: bool) -> None:
 
 @pytest.mark.parametrize("clock_rate", [0.99, 1.01])
 def test_old_frames_wrong_clocks_and_other_rates_break_no_promise(clock_rate: float) -> None:
-    wrong = Crooked("another clock", says=clock(lambda t_s: clock_rate * t_s))
-    keep_all_promises(False, Served(OLD, crooked=wrong))
+    wrong = Defect("another clock", sends=clock(lambda t_s: clock_rate * t_s))
+    keep_all_promises(False, Served(OLD, broken=wrong))
 
 
 def test_the_robot_is_left_held_and_its_fans_as_they_were(config: Config) -> None:
@@ -99,13 +99,13 @@ def test_the_robot_is_left_held_and_its_fans_as_they_were(config: Config) -> Non
 def test_no_motion_turns_no_wheel(config: Config) -> None:
     received: list[bytes] = []
 
-    def hears(data: bytes, _: object) -> bytes:
+    def altered(data: bytes, _: object) -> bytes:
         received.append(data)
         return data
 
     drives = ("echo", "newest-drive", "fans-rst", "no-json", "nan", "many-lines", "single-bytes", "lockstep-drive")
     only = (*drives, *(name for name, needs in NEEDS.items() if "motion" in needs))
-    results = checked(config, only, lockstep=True, crooked=Crooked("received", hears=hears), motion=False)
+    results = checked(config, only, lockstep=True, broken=Defect("received", receives=altered), motion=False)
     sent = b"".join(received)
     assert sent.count(b'"drive"') > 100
     assert not re.search(rb'"w[rl]":"?-?[0.]*[1-9]', sent)
@@ -114,13 +114,13 @@ def test_no_motion_turns_no_wheel(config: Config) -> None:
 
 
 def test_a_hello_of_no_use_fails_its_check_and_stops_the_others(config: Config) -> None:
-    def says(message: dict[str, object], _: object) -> dict[str, object]:
+    def sent(message: dict[str, object], _: object) -> dict[str, object]:
         if message["type"] == "hello":
             message["ttl_s"] = "0.25"
         return message
 
-    crooked = Crooked("ttl as text", says=says)
-    results = checked(config, lockstep=True, crooked=crooked)
+    broken = Defect("ttl as text", sends=sent)
+    results = checked(config, lockstep=True, broken=broken)
     assert [(r.check_id, r.detail) for r in results if r.outcome == "fail"] == [("hello", "ttl_s = '0.25'")]
     assert [r.check_id for r in results if r.outcome == "pass"] == ["hello-robot"]
     assert results[2].detail == "the hello is of no use: ttl_s = '0.25'"
@@ -165,13 +165,13 @@ def test_a_surprise_before_or_after_the_checks_leaves_their_results(
 
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_a_late_first_frame_of_the_controller_breaks_no_promise(config: Config, lockstep: bool) -> None:
-    def says(message: dict[str, object], middle: Middle) -> dict[str, object] | None:
+    def sent(message: dict[str, object], middle: Middle) -> dict[str, object] | None:
         if message["type"] == "joined" and message["role"] == "controller":
             controllers.append(middle)
         return None if middle in controllers and 2 < middle.count < 9 else message  # after hello and joined
 
     controllers: list[Middle] = []
-    results = checked(config, ["seq-session"], lockstep=lockstep, crooked=Crooked("late", says=says))
+    results = checked(config, ["seq-session"], lockstep=lockstep, broken=Defect("late", sends=sent))
     assert [(result.outcome, result.detail) for result in results if result.outcome != "pass"] == []
 
 
@@ -181,8 +181,8 @@ def test_a_late_first_frame_of_the_controller_breaks_no_promise(config: Config, 
 @pytest.fixture
 def robot(config: Config, request: pytest.FixtureRequest) -> Iterator[str]:
     """A robot in lockstep, with a key or a fault where a test names one; its address."""
-    crooked, key = getattr(request, "param", (HONEST, None))
-    with serving(config, lockstep=True, crooked=crooked, key=key) as server:
+    broken, key = getattr(request, "param", (CORRECT, None))
+    with serving(config, lockstep=True, broken=broken, key=key) as server:
         yield f"127.0.0.1:{server.port}"
 
 
@@ -190,8 +190,8 @@ def _on_fire(message: dict[str, object], _: object) -> dict[str, object]:
     return message | {"faults": ["on_fire"]} if message["type"] == "sensors" else message
 
 
-broken = pytest.mark.parametrize("robot", [(Crooked("on fire", says=_on_fire), None)], indirect=True, ids=["broken"])
-locked = pytest.mark.parametrize("robot", [(HONEST, KEY)], indirect=True, ids=["locked"])
+broken = pytest.mark.parametrize("robot", [(Defect("on fire", sends=_on_fire), None)], indirect=True, ids=["broken"])
+locked = pytest.mark.parametrize("robot", [(CORRECT, KEY)], indirect=True, ids=["locked"])
 
 
 def test_json_alone_on_standard_output(robot: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from ccatp.links.robot_messages import Drive, Permit, Role
 from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.onboard.rules import MotionRules
-from tests.contract.crooked import Crooked, Message, Middle, around, checked, clock, each, of, put, rules, swap
+from tests.contract.crooked import Defect, Message, Middle, around, checked, clock, each, of, put, rules, swap
 from tests.support.scenario import SurveyLoop, config_of
 
 KEY = b"secret"
@@ -91,7 +91,7 @@ def _join_by_drive(data: bytes, middle: Middle) -> bytes:
 def _mac(is_good: Callable[[Message, Middle], bool]) -> Callable[[bytes, Middle], bytes]:
     """Macs that are not right, and taken."""
 
-    def hears(data: bytes, middle: Middle) -> bytes:
+    def received(data: bytes, middle: Middle) -> bytes:
         if b'"join"' not in data:
             return data
         join = json.loads(data)
@@ -99,7 +99,7 @@ def _mac(is_good: Callable[[Message, Middle], bool]) -> Callable[[bytes, Middle]
             join["mac"] = join_mac(KEY, middle.hello["nonce"], join["role"])
         return json.dumps(join).encode() + b"\n"
 
-    return hears
+    return received
 
 
 def _mac_of_any(join: Message, middle: Middle) -> bool:
@@ -131,47 +131,47 @@ def _notes_what_was_sent(data: bytes, middle: Middle) -> bytes:
 
 
 SESSIONS = [
-    Crooked("wheel radius in mm", "hello-robot", HELLO, says=_of_robot(wheel_radius_m=30.0)),
-    Crooked("wheel base in mm", "hello-robot", HELLO, says=_of_robot(wheel_base_m=150.0)),
-    Crooked("top speed in rpm", "hello-robot", HELLO, says=_of_robot(max_wheel_rad_s=76.4)),
-    Crooked("edge sensors in mm", "hello-robot", HELLO,
-            says=_of_robot(edge_sensors_m=[[90.0, 90.0], [90.0, -90.0], [-90.0, 90.0], [-90.0, -90.0]])),
-    Crooked("puck in mm", "hello-robot", HELLO, says=_of_robot(puck_m=[0.0, 0.0, 50.0])),
-    Crooked("fan floor in per cent", "hello-robot", HELLO, says=_of_robot(fan_floor=60.0)),
-    Crooked("no puck", "hello-robot", HELLO, says=of("hello", lambda hello, _: hello["robot"].pop("puck_m"))),
-    Crooked("a time-to-live of five seconds", "hello", HELLO, says=put("hello", ttl_s=5.0)),
-    Crooked("time-to-live in ms", "hello", HELLO, says=put("hello", ttl_s=250.0)),
-    Crooked("period of the frames for their rate", "hello", HELLO, says=put("hello", frame_hz=0.01)),
-    Crooked("one session number for all", "join", JOIN, says=put("joined", session=1)),
-    Crooked("joins of another protocol", "join-protocol", JOIN, hears=swap(b"ccatp-robot/0", b"ccatp-robot/1")),
-    Crooked("refuses and stays", "join-role join-client join-first join-protocol", JOIN[1:5],
-            twist=around("refuse", _stays)),
-    Crooked("no frame without a drive", "frames-first", ("frames-first",), says=_first_asks,
-            hears=_notes_what_was_sent),
-    Crooked("protocol of another version", "hello", HELLO, says=put("hello", protocol="ccatp-robot/2")),
-    Crooked("boot as text", "hello", HELLO, says=put("hello", boot="417")),
-    Crooked("edge sensors in another order", "hello-robot", HELLO, says=of("hello", _edges)),
-    Crooked("a repeated nonce", "nonce", HELLO, says=put("hello", nonce="0" * 32)),
-    Crooked("a boot per connection", "boot", HELLO, says=of("hello", _boots)),
-    Crooked("joined without session", "join", JOIN, says=of("joined", lambda joined, _: joined.pop("session"))),
-    Crooked("an unknown role taken for monitor", "join-role", JOIN[:5], hears=swap(b"king", b"monitor")),
-    Crooked("a join without client", "join-client", JOIN, hears=swap(b'"controller"}', b'"controller","client":"x"}')),
-    Crooked("joined by a drive", "join-first", JOIN, hears=_join_by_drive),
-    Crooked("the last to come has the role", "role-taken refused-harmless", JOIN,
-            twist=around("join", _throw_out)),
-    Crooked("a refusal closes the holders, too", "role-taken refused-harmless", JOIN,
-            twist=around("refuse", _disturb)),
-    Crooked("waits for joins for ever", "join-late", ("join-late", "join"), twist=_patient(60.0)),
-    Crooked("waits for joins half a second", "join-late join-in-time",
-            ("join-late", "join-in-time", "join"), twist=_patient(-1.5)),
+    Defect("wheel radius in mm", "hello-robot", HELLO, sends=_of_robot(wheel_radius_m=30.0)),
+    Defect("wheel base in mm", "hello-robot", HELLO, sends=_of_robot(wheel_base_m=150.0)),
+    Defect("top speed in rpm", "hello-robot", HELLO, sends=_of_robot(max_wheel_rad_s=76.4)),
+    Defect("edge sensors in mm", "hello-robot", HELLO,
+            sends=_of_robot(edge_sensors_m=[[90.0, 90.0], [90.0, -90.0], [-90.0, 90.0], [-90.0, -90.0]])),
+    Defect("puck in mm", "hello-robot", HELLO, sends=_of_robot(puck_m=[0.0, 0.0, 50.0])),
+    Defect("fan floor in per cent", "hello-robot", HELLO, sends=_of_robot(fan_floor=60.0)),
+    Defect("no puck", "hello-robot", HELLO, sends=of("hello", lambda hello, _: hello["robot"].pop("puck_m"))),
+    Defect("a time-to-live of five seconds", "hello", HELLO, sends=put("hello", ttl_s=5.0)),
+    Defect("time-to-live in ms", "hello", HELLO, sends=put("hello", ttl_s=250.0)),
+    Defect("period of the frames for their rate", "hello", HELLO, sends=put("hello", frame_hz=0.01)),
+    Defect("one session number for all", "join", JOIN, sends=put("joined", session=1)),
+    Defect("joins of another protocol", "join-protocol", JOIN, receives=swap(b"ccatp-robot/0", b"ccatp-robot/1")),
+    Defect("refuses and stays", "join-role join-client join-first join-protocol", JOIN[1:5],
+            modify=around("refuse", _stays)),
+    Defect("no frame without a drive", "frames-first", ("frames-first",), sends=_first_asks,
+            receives=_notes_what_was_sent),
+    Defect("protocol of another version", "hello", HELLO, sends=put("hello", protocol="ccatp-robot/2")),
+    Defect("boot as text", "hello", HELLO, sends=put("hello", boot="417")),
+    Defect("edge sensors in another order", "hello-robot", HELLO, sends=of("hello", _edges)),
+    Defect("a repeated nonce", "nonce", HELLO, sends=put("hello", nonce="0" * 32)),
+    Defect("a boot per connection", "boot", HELLO, sends=of("hello", _boots)),
+    Defect("joined without session", "join", JOIN, sends=of("joined", lambda joined, _: joined.pop("session"))),
+    Defect("an unknown role taken for monitor", "join-role", JOIN[:5], receives=swap(b"king", b"monitor")),
+    Defect("join without client", "join-client", JOIN, receives=swap(b'"controller"}', b'"controller","client":"x"}')),
+    Defect("joined by a drive", "join-first", JOIN, receives=_join_by_drive),
+    Defect("the last to come has the role", "role-taken refused-harmless", JOIN,
+            modify=around("join", _throw_out)),
+    Defect("a refusal closes the holders, too", "role-taken refused-harmless", JOIN,
+            modify=around("refuse", _disturb)),
+    Defect("waits for joins for ever", "join-late", ("join-late", "join"), modify=_patient(60.0)),
+    Defect("waits for joins half a second", "join-late join-in-time",
+            ("join-late", "join-in-time", "join"), modify=_patient(-1.5)),
 ]  # fmt: skip
 MACS = [
-    Crooked("takes every mac", " ".join(MAC[1:]), MAC, hears=_mac(lambda *_: True)),
-    Crooked("takes a bad mac", "mac-wrong mac-nonce mac-role", MAC, hears=_mac(lambda join, _: "mac" in join)),
-    Crooked("takes no mac", "mac-missing", MAC, hears=_mac(lambda join, _: "mac" not in join)),
-    Crooked("takes a mac of any connection", "mac-nonce", MAC, hears=_mac(_mac_of_any)),
-    Crooked("takes a mac of any role", "mac-role", MAC, hears=_mac(_mac_of_any_role)),
-    Crooked("says bad join of a bad mac", "mac-wrong mac-nonce mac-role", MAC, says=put("refused", reason="bad join")),
+    Defect("takes every mac", " ".join(MAC[1:]), MAC, receives=_mac(lambda *_: True)),
+    Defect("takes a bad mac", "mac-wrong mac-nonce mac-role", MAC, receives=_mac(lambda join, _: "mac" in join)),
+    Defect("takes no mac", "mac-missing", MAC, receives=_mac(lambda join, _: "mac" not in join)),
+    Defect("takes a mac of any connection", "mac-nonce", MAC, receives=_mac(_mac_of_any)),
+    Defect("takes a mac of any role", "mac-role", MAC, receives=_mac(_mac_of_any_role)),
+    Defect("says bad join of a bad mac", "mac-wrong mac-nonce mac-role", MAC, sends=put("refused", reason="bad join")),
 ]  # fmt: skip
 
 # -- frames -----------------------------------------------------------------------------------------------------------
@@ -214,41 +214,41 @@ def _gravity(change: Callable[[float, float, float, float], list[float]]) -> Cal
 
 
 STREAMS = [
-    Crooked("samples of three frames ago", "frames-times", FRAMES, says=_shifted("enc", 0.03)),
-    Crooked("samples of the next frame", "frames-times", FRAMES, says=_shifted("edge", -0.01)),
-    Crooked("samples with the frame's time", "frames-times", FRAMES, says=each(
+    Defect("samples of three frames ago", "frames-times", FRAMES, sends=_shifted("enc", 0.03)),
+    Defect("samples of the next frame", "frames-times", FRAMES, sends=_shifted("edge", -0.01)),
+    Defect("samples with the frame's time", "frames-times", FRAMES, sends=each(
         lambda f: _fix("enc", f, 0, f["t"]))),
-    Crooked("gravity of a second ago", "frames-times", FRAMES, says=_gravity(lambda t, *g: [t - 1.0, *g])),
-    Crooked("gravity of the time to come", "frames-times", FRAMES, says=_gravity(lambda t, *g: [t + 0.5, *g])),
-    Crooked("gravity points up", "frames-gravity", FRAMES, says=_gravity(lambda t, x, y, z: [t, -x, -y, -z])),
-    Crooked("time in ms", "frames-clock", ("frames-clock",), says=clock(lambda t_s: 1000.0 * t_s)),
-    Crooked("time in whole seconds", "frames-clock", ("frames-clock",), says=each(lambda f: f.update(t=f["t"] // 1))),
-    Crooked("a clock that jumps back", "frames-clock", ("frames-clock",),
-            says=clock(lambda t_s: t_s - 0.05 * (round(100 * t_s) % 10 == 0))),
-    Crooked("ages in ms", "echo", FRAMES, says=each(lambda f: f["cmd"].update(age=1000.0 * f["cmd"]["age"]))),
-    Crooked("fan duties in per cent", "frames-state", FRAMES, says=each(
+    Defect("gravity of a second ago", "frames-times", FRAMES, sends=_gravity(lambda t, *g: [t - 1.0, *g])),
+    Defect("gravity of the time to come", "frames-times", FRAMES, sends=_gravity(lambda t, *g: [t + 0.5, *g])),
+    Defect("gravity points up", "frames-gravity", FRAMES, sends=_gravity(lambda t, x, y, z: [t, -x, -y, -z])),
+    Defect("time in ms", "frames-clock", ("frames-clock",), sends=clock(lambda t_s: 1000.0 * t_s)),
+    Defect("time in whole seconds", "frames-clock", ("frames-clock",), sends=each(lambda f: f.update(t=f["t"] // 1))),
+    Defect("a clock that jumps back", "frames-clock", ("frames-clock",),
+            sends=clock(lambda t_s: t_s - 0.05 * (round(100 * t_s) % 10 == 0))),
+    Defect("ages in ms", "echo", FRAMES, sends=each(lambda f: f["cmd"].update(age=1000.0 * f["cmd"]["age"]))),
+    Defect("fan duties in per cent", "frames-state", FRAMES, sends=each(
         lambda f: f.update(fans=[100.0 * duty + 50.0 for duty in f["fans"]]))),
-    Crooked("a rate that is no number", "frames-lines", ("frames-lines", "frames-seq"),
-            says=each(lambda f: _fix("imu", f, 2, math.nan))),
-    Crooked("a key twice", "frames-lines", FRAMES, says=_key_twice),
-    Crooked("another rate than the hello's", "frames-clock", FRAMES, says=put("hello", frame_hz=60.0)),
-    Crooked("samples of two", "frames-samples", FRAMES,
-            says=each(lambda frame: frame.update(imu=[sample[:2] for sample in frame["imu"]]))),
-    Crooked("newest samples first", "frames-times", FRAMES, says=each(lambda f: f["enc"].reverse())),
-    Crooked("samples of the frame before", "frames-times", FRAMES,
-            says=each(lambda f: [sample.__setitem__(0, sample[0] - 0.015) for sample in f["imu"]])),
-    Crooked("three times as many", "frames-rates", FRAMES, says=each(_thrice)),
-    Crooked("an edge of two", "frames-edge", FRAMES, says=each(lambda f: _fix("edge", f, 3, 2))),
-    Crooked("gravity in m/s2", "frames-gravity", FRAMES, says=each(
+    Defect("a rate that is no number", "frames-lines", ("frames-lines", "frames-seq"),
+            sends=each(lambda f: _fix("imu", f, 2, math.nan))),
+    Defect("a key twice", "frames-lines", FRAMES, sends=_key_twice),
+    Defect("another rate than the hello's", "frames-clock", FRAMES, sends=put("hello", frame_hz=60.0)),
+    Defect("samples of two", "frames-samples", FRAMES,
+            sends=each(lambda frame: frame.update(imu=[sample[:2] for sample in frame["imu"]]))),
+    Defect("newest samples first", "frames-times", FRAMES, sends=each(lambda f: f["enc"].reverse())),
+    Defect("samples of the frame before", "frames-times", FRAMES,
+            sends=each(lambda f: [sample.__setitem__(0, sample[0] - 0.015) for sample in f["imu"]])),
+    Defect("three times as many", "frames-rates", FRAMES, sends=each(_thrice)),
+    Defect("an edge of two", "frames-edge", FRAMES, sends=each(lambda f: _fix("edge", f, 3, 2))),
+    Defect("gravity in m/s2", "frames-gravity", FRAMES, sends=each(
         lambda f: f["gravity"] and f.update(gravity=[f["gravity"][0], 0.0, 0.0, -9.81]))),
-    Crooked("charge in per cent", "frames-state", FRAMES, says=put("sensors", soc=93.0)),
-    Crooked("a fault of its own", "frames-faults", FRAMES, says=put("sensors", faults=["on_fire"])),
-    Crooked("ages below zero", "frames-cmd", FRAMES,
-            says=each(lambda frame: frame["cmd"].update(age=frame["cmd"]["age"] - 0.02))),
-    Crooked("a monitor that misses frames", "frames-all", FRAMES, says=_not_each_to_the_monitor),
-    Crooked("frames for all who connect", "frames-joined", FRAMES, twist=around("_send_frame", _to_all)),
-    Crooked("an echo that jumps", "echo", FRAMES,
-            says=each(lambda frame: frame["seq"] % 5 or frame["cmd"].update(seq=7))),
+    Defect("charge in per cent", "frames-state", FRAMES, sends=put("sensors", soc=93.0)),
+    Defect("a fault of its own", "frames-faults", FRAMES, sends=put("sensors", faults=["on_fire"])),
+    Defect("ages below zero", "frames-cmd", FRAMES,
+            sends=each(lambda frame: frame["cmd"].update(age=frame["cmd"]["age"] - 0.02))),
+    Defect("a monitor that misses frames", "frames-all", FRAMES, sends=_not_each_to_the_monitor),
+    Defect("frames for all who connect", "frames-joined", FRAMES, modify=around("_send_frame", _to_all)),
+    Defect("an echo that jumps", "echo", FRAMES,
+            sends=each(lambda frame: frame["seq"] % 5 or frame["cmd"].update(seq=7))),
 ]  # fmt: skip
 
 # -- what is newest, fans, lines --------------------------------------------------------------------------------------
@@ -312,38 +312,38 @@ def _counts_none(_: SurveyLoop, command: Any, session: Any, role: Any, message: 
 
 
 COMMANDS = [
-    Crooked("remembers the numbers of the session before", "seq-session", ("seq-session",),
-            twist=lambda loop: setattr(loop.robot, "_forget", lambda _: None)),
-    Crooked("fans exchanged", "fans", ("fans",), says=each(lambda f: f["fans"].reverse())),
-    Crooked("does not count what is not for a role", "bad-lines-role", LINES, twist=around("command", _counts_none)),
-    *(Crooked(f"obeys {what} {order}", f"newest-{what}", NEWEST, twist=_taken(what, is_taken))
+    Defect("remembers the numbers of the session before", "seq-session", ("seq-session",),
+            modify=lambda loop: setattr(loop.robot, "_forget", lambda _: None)),
+    Defect("fans exchanged", "fans", ("fans",), sends=each(lambda f: f["fans"].reverse())),
+    Defect("does not count what is not for a role", "bad-lines-role", LINES, modify=around("command", _counts_none)),
+    *(Defect(f"obeys {what} {order}", f"newest-{what}", NEWEST, modify=_taken(what, is_taken))
       for order, is_taken in (("that are old", int.__lt__), ("twice", int.__eq__))
       for what in ("drive", "permit", "fans")),
-    Crooked("obeys drives of the monitor", "role-drive", NEWEST, twist=_obey(Drive)),
-    Crooked("obeys fans of the monitor", "role-fans", NEWEST, twist=_obey(FansMessage)),
-    Crooked("has no fans", "fans", ("fans",), hears=swap(b'"fans"', b'"sails"')),
-    Crooked("stops fans at a lost session", "fans-fin fans-rst", FANS,
-            twist=around("robot.lose", _fans_off_when_lost)),
-    Crooked("stops fans at a stop", "fans-stop", FANS, twist=around("robot.permit", _fans_off_when_denied)),
-    *(Crooked(f"takes {kind}", kind, tuple(BAD_DRIVES), hears=CORRECTED[kind]) for kind in BAD_DRIVES),
-    Crooked("refuses unknown keys", "unknown-key", LINES, hears=swap(b'"colour":', b'"colour",')),
-    Crooked("counts unknown types as bad", "unknown-type", LINES, hears=swap(b'"dance","s', b'dance",s')),
-    Crooked("closes after five bad lines", "bad-lines-few", LINES,
-            twist=_each_session(lambda session: setattr(session, "_bad", BadLineCounter(5)))),
-    Crooked("bears any number of bad lines", "bad-lines-many bad-lines-role", LINES,
-            twist=_each_session(lambda session: setattr(session, "_bad", BadLineCounter(10_000)))),
-    Crooked("knows short lines only", "line-longest", LINES,
-            twist=_each_session(lambda session: setattr(session, "_lines", LineBuffer(4096)))),
-    Crooked("knows endless lines", "line-too-long", LINES,
-            twist=_each_session(lambda session: setattr(session, "_lines", LineBuffer(1 << 20)))),
-    Crooked("takes segments for lines", "single-bytes", LINES, hears=_no_buffer),
-    Crooked("reads one line of a segment", "many-lines glued-lines",
-            ("many-lines", "glued-lines", "unknown-key"), hears=lambda data, _: data.partition(b"\n")[0] + b"\n"),
+    Defect("obeys drives of the monitor", "role-drive", NEWEST, modify=_obey(Drive)),
+    Defect("obeys fans of the monitor", "role-fans", NEWEST, modify=_obey(FansMessage)),
+    Defect("has no fans", "fans", ("fans",), receives=swap(b'"fans"', b'"sails"')),
+    Defect("stops fans at a lost session", "fans-fin fans-rst", FANS,
+            modify=around("robot.lose", _fans_off_when_lost)),
+    Defect("stops fans at a stop", "fans-stop", FANS, modify=around("robot.permit", _fans_off_when_denied)),
+    *(Defect(f"takes {kind}", kind, tuple(BAD_DRIVES), receives=CORRECTED[kind]) for kind in BAD_DRIVES),
+    Defect("refuses unknown keys", "unknown-key", LINES, receives=swap(b'"colour":', b'"colour",')),
+    Defect("counts unknown types as bad", "unknown-type", LINES, receives=swap(b'"dance","s', b'dance",s')),
+    Defect("closes after five bad lines", "bad-lines-few", LINES,
+            modify=_each_session(lambda session: setattr(session, "_bad", BadLineCounter(5)))),
+    Defect("bears any number of bad lines", "bad-lines-many bad-lines-role", LINES,
+            modify=_each_session(lambda session: setattr(session, "_bad", BadLineCounter(10_000)))),
+    Defect("knows short lines only", "line-longest", LINES,
+            modify=_each_session(lambda session: setattr(session, "_lines", LineBuffer(4096)))),
+    Defect("knows endless lines", "line-too-long", LINES,
+            modify=_each_session(lambda session: setattr(session, "_lines", LineBuffer(1 << 20)))),
+    Defect("takes segments for lines", "single-bytes", LINES, receives=_no_buffer),
+    Defect("reads one line of a segment", "many-lines glued-lines",
+            ("many-lines", "glued-lines", "unknown-key"), receives=lambda data, _: data.partition(b"\n")[0] + b"\n"),
 ]  # fmt: skip
 FLOORS = [
-    Crooked("goes below the floor", "fan-floor", FANS, twist=lambda loop: setattr(loop.robot.fans, "_floor", 0.0)),
-    Crooked("calls a clamped duty a fault", "fan-floor", FANS,
-            says=each(lambda frame: 0.6 in frame["fans"] and frame.update(faults=["fan_left"]))),
+    Defect("goes below the floor", "fan-floor", FANS, modify=lambda loop: setattr(loop.robot.fans, "_floor", 0.0)),
+    Defect("calls a clamped duty a fault", "fan-floor", FANS,
+            sends=each(lambda frame: 0.6 in frame["fans"] and frame.update(faults=["fan_left"]))),
 ]  # fmt: skip
 
 # -- lockstep and motion ----------------------------------------------------------------------------------------------
@@ -434,29 +434,29 @@ ALL_MOVES = " ".join(name for name in MOVES if name != "move-clamp")
 STRAIGHT = ("move-forward", "move-turn")
 INERTIAL = ("gyroscope", "accelerometer")
 QUANTITIES = [
-    *(Crooked(f"encoders {what}", "move-forward move-turn", STRAIGHT, says=_wheels(factor, factor))
+    *(Defect(f"encoders {what}", "move-forward move-turn", STRAIGHT, sends=_wheels(factor, factor))
       for what, factor in (("in rpm", 9.55), ("in degrees", 57.3), ("in turns per second", 0.159),
                            ("of the motor's shaft", 20.0), ("of the other sign", -1.0), ("that stand still", 0.0))),
-    Crooked("right encoder of the other sign", "move-forward move-turn", STRAIGHT, says=_wheels(-1.0, 1.0)),
-    Crooked("left encoder that is dead", "move-forward move-turn", STRAIGHT, says=_wheels(1.0, 0.0)),
-    Crooked("drives taken for rpm", "move-forward", STRAIGHT[:1], twist=_motors(lambda a, b: (a / 9.55, b / 9.55))),
-    Crooked("drives taken for degrees", "move-forward", STRAIGHT[:1],
-            twist=_motors(lambda a, b: (a / 57.3, b / 57.3))),
-    Crooked("motors exchanged", "move-turn", STRAIGHT, twist=_motors(lambda a, b: (b, a))),
-    Crooked("wheels exchanged, encoders too", "gyroscope", INERTIAL, says=each(_sides),
-            twist=_motors(lambda a, b: (b, a))),
-    Crooked("wheels reversed, encoders too", "gyroscope accelerometer", INERTIAL, says=_wheels(-1.0, -1.0),
-            twist=_motors(lambda a, b: (-a, -b))),
-    Crooked("half the wheel base", "gyroscope", INERTIAL, says=_of_robot(wheel_base_m=0.075)),
-    Crooked("diameter for the radius", "gyroscope accelerometer", INERTIAL, says=_of_robot(wheel_radius_m=0.06)),
-    *(Crooked(f"gyroscope {what}", "gyroscope", INERTIAL, says=_scaled("imu", 2, factor))
+    Defect("right encoder of the other sign", "move-forward move-turn", STRAIGHT, sends=_wheels(-1.0, 1.0)),
+    Defect("left encoder that is dead", "move-forward move-turn", STRAIGHT, sends=_wheels(1.0, 0.0)),
+    Defect("drives taken for rpm", "move-forward", STRAIGHT[:1], modify=_motors(lambda a, b: (a / 9.55, b / 9.55))),
+    Defect("drives taken for degrees", "move-forward", STRAIGHT[:1],
+            modify=_motors(lambda a, b: (a / 57.3, b / 57.3))),
+    Defect("motors exchanged", "move-turn", STRAIGHT, modify=_motors(lambda a, b: (b, a))),
+    Defect("wheels exchanged, encoders too", "gyroscope", INERTIAL, sends=each(_sides),
+            modify=_motors(lambda a, b: (b, a))),
+    Defect("wheels reversed, encoders too", "gyroscope accelerometer", INERTIAL, sends=_wheels(-1.0, -1.0),
+            modify=_motors(lambda a, b: (-a, -b))),
+    Defect("half the wheel base", "gyroscope", INERTIAL, sends=_of_robot(wheel_base_m=0.075)),
+    Defect("diameter for the radius", "gyroscope accelerometer", INERTIAL, sends=_of_robot(wheel_radius_m=0.06)),
+    *(Defect(f"gyroscope {what}", "gyroscope", INERTIAL, sends=_scaled("imu", 2, factor))
       for what, factor in (("in degrees", 57.3), ("of the other sign", -1.0), ("in turns per second", 0.159),
                            ("that is dead", 0.0))),
-    *(Crooked(f"accelerometer {what}", "accelerometer", INERTIAL, says=_scaled("imu", 1, factor))
+    *(Defect(f"accelerometer {what}", "accelerometer", INERTIAL, sends=_scaled("imu", 1, factor))
       for what, factor in (("in g", 1.0 / 9.81), ("of the other sign", -1.0), ("in mm/s2", 1000.0),
                            ("that is dead", 0.0))),
-    Crooked("accelerometer and gyroscope exchanged", "gyroscope accelerometer", INERTIAL, says=each(_columns)),
-    Crooked("gravity in the acceleration", "accelerometer", INERTIAL, says=each(_with_gravity)),
+    Defect("accelerometer and gyroscope exchanged", "gyroscope accelerometer", INERTIAL, sends=each(_columns)),
+    Defect("gravity in the acceleration", "accelerometer", INERTIAL, sends=each(_with_gravity)),
 ]  # fmt: skip
 
 
@@ -525,37 +525,37 @@ def _curves(is_allowed: Callable[[bool, bool], tuple[bool, bool]]) -> Callable[[
 
 CURVES = ("move-curve", "move-curve-back", "move-turn")
 RULES = [
-    Crooked("ignores a drive of zero", "wheels-stop", ("wheels-stop", "move-turn"), twist=rules(drive=_goes_on)),
-    Crooked("knows no top speed", "move-clamp", MOVES[-1:],
-            twist=lambda loop: setattr(loop.robot.rules, "_max_wheel_rad_s", math.inf)),
-    Crooked("clamps each wheel by itself", "move-clamp", MOVES, twist=rules(drive=_each_wheel)),
-    Crooked("stops at drives beyond the top speed", "move-clamp", MOVES[-1:], twist=rules(drive=_not_beyond)),
-    Crooked("remembers what was allowed", ALL_MOVES, MOVES, twist=_judging(_remembered)),
-    Crooked("allows each direction for its own time-to-live", ALL_MOVES, MOVES, twist=_judging(_while_it_lasts)),
-    Crooked("takes permits at rest only", ALL_MOVES, MOVES[:-1], twist=_judging(_until_it_stands)),
-    Crooked("forward and reverse exchanged", "move-forward move-reverse move-curve move-curve-back", MOVES[:-1],
-            twist=_judging(lambda _, new, __: (new[1], new[0], new[2]))),
-    Crooked("takes no notice of permits", ALL_MOVES, MOVES[:-1], twist=_judging(lambda *_: (True, True, True))),
-    Crooked("curves need no turn", "move-curve", CURVES, twist=_curves(lambda straight, _: (straight, True))),
-    Crooked("curves need turn alone", "move-curve-back", CURVES, twist=_curves(lambda _, turn: (True, turn))),
+    Defect("ignores a drive of zero", "wheels-stop", ("wheels-stop", "move-turn"), modify=rules(drive=_goes_on)),
+    Defect("knows no top speed", "move-clamp", MOVES[-1:],
+            modify=lambda loop: setattr(loop.robot.rules, "_max_wheel_rad_s", math.inf)),
+    Defect("clamps each wheel by itself", "move-clamp", MOVES, modify=rules(drive=_each_wheel)),
+    Defect("stops at drives beyond the top speed", "move-clamp", MOVES[-1:], modify=rules(drive=_not_beyond)),
+    Defect("remembers what was allowed", ALL_MOVES, MOVES, modify=_judging(_remembered)),
+    Defect("allows each direction for its own time-to-live", ALL_MOVES, MOVES, modify=_judging(_while_it_lasts)),
+    Defect("takes permits at rest only", ALL_MOVES, MOVES[:-1], modify=_judging(_until_it_stands)),
+    Defect("forward and reverse exchanged", "move-forward move-reverse move-curve move-curve-back", MOVES[:-1],
+            modify=_judging(lambda _, new, __: (new[1], new[0], new[2]))),
+    Defect("takes no notice of permits", ALL_MOVES, MOVES[:-1], modify=_judging(lambda *_: (True, True, True))),
+    Defect("curves need no turn", "move-curve", CURVES, modify=_curves(lambda straight, _: (straight, True))),
+    Defect("curves need turn alone", "move-curve-back", CURVES, modify=_curves(lambda _, turn: (True, turn))),
 ]  # fmt: skip
 
 STEPS = [
-    Crooked("does not wait for drives", "lockstep-drive", LOCKSTEP[:2], twist=_never_waits("controller")),
-    Crooked("does not wait for permits", "lockstep-permit", LOCKSTEP[:2], twist=_never_waits("monitor")),
-    Crooked("takes any ack", "lockstep-ack", LOCKSTEP, twist=around("command", _any_ack)),
-    Crooked("takes two steps", "lockstep-step", LOCKSTEP[3:4], twist=around("_advance", _two_steps)),
-    Crooked(
-        "measures ages on the wall clock", "lockstep-ages lockstep-repeat", LOCKSTEP, says=of("sensors", _wall_ages)
+    Defect("does not wait for drives", "lockstep-drive", LOCKSTEP[:2], modify=_never_waits("controller")),
+    Defect("does not wait for permits", "lockstep-permit", LOCKSTEP[:2], modify=_never_waits("monitor")),
+    Defect("takes any ack", "lockstep-ack", LOCKSTEP, modify=around("command", _any_ack)),
+    Defect("takes two steps", "lockstep-step", LOCKSTEP[3:4], modify=around("_advance", _two_steps)),
+    Defect(
+        "measures ages on the wall clock", "lockstep-ages lockstep-repeat", LOCKSTEP, sends=of("sensors", _wall_ages)
     ),
-    Crooked("sends no frame again", "lockstep-repeat", LOCKSTEP, twist=around("_send_frame", _only_once)),
-    Crooked("sends another frame of the same number", "lockstep-repeat", LOCKSTEP[-1:], says=of("sensors", _emptied)),
-    Crooked("drives forward without permit", "move-forward", MOVES, twist=_allowing(forward=True)),
-    Crooked("reverses without permit", "move-reverse move-curve-back", MOVES, twist=_allowing(reverse=True)),
-    Crooked("turns without permit", "move-turn move-turn-back move-curve", MOVES, twist=_allowing(turn=True)),
-    Crooked("never reverses", "move-reverse move-curve-back move-clamp", MOVES, twist=_allowing(reverse=False)),
-    Crooked("says held and turns", ALL_MOVES, MOVES, twist=rules(set_points=_lie)),
-    Crooked("encoders on the wrong side", " ".join(MOVES[2:]), MOVES, says=each(_sides)),
+    Defect("sends no frame again", "lockstep-repeat", LOCKSTEP, modify=around("_send_frame", _only_once)),
+    Defect("sends another frame of the same number", "lockstep-repeat", LOCKSTEP[-1:], sends=of("sensors", _emptied)),
+    Defect("drives forward without permit", "move-forward", MOVES, modify=_allowing(forward=True)),
+    Defect("reverses without permit", "move-reverse move-curve-back", MOVES, modify=_allowing(reverse=True)),
+    Defect("turns without permit", "move-turn move-turn-back move-curve", MOVES, modify=_allowing(turn=True)),
+    Defect("never reverses", "move-reverse move-curve-back move-clamp", MOVES, modify=_allowing(reverse=False)),
+    Defect("says held and turns", ALL_MOVES, MOVES, modify=rules(set_points=_lie)),
+    Defect("encoders on the wrong side", " ".join(MOVES[2:]), MOVES, sends=each(_sides)),
 ]  # fmt: skip
 
 # -- in real time ------------------------------------------------------------------------------------------------
@@ -612,13 +612,13 @@ def _soon_taken_over(_: SurveyLoop, command: Any, session: Any, *args: Any) -> A
 def _fans_stop_with_wheels(loop: SurveyLoop) -> None:
     set_points = loop.robot.rules.set_points
 
-    def crooked(_: MotionRules, until_s: float) -> tuple[float, float]:
+    def broken(_: MotionRules, until_s: float) -> tuple[float, float]:
         found = set_points(until_s)
         if loop.robot.rules._drive is not None and loop.robot.rules.is_held:
             loop.robot.fans.duty = (0.0, 0.0)
         return found
 
-    rules(set_points=crooked)(loop)
+    rules(set_points=broken)(loop)
 
 
 def _forgets(forgotten: Role) -> Callable[[SurveyLoop], None]:
@@ -660,59 +660,59 @@ def _inverted(frame: Message) -> None:
 
 LOST = {role: f"lost-{role}-fin lost-{role}-rst" for role in ("controller", "monitor")}
 REALTIME = [
-    Crooked("keeps a role for bad lines", "take-over", ("take-over",), hears=_noise_keeps_the_role),
-    Crooked("gives roles away too soon", "take-over", ("take-over",), twist=around("command", _soon_taken_over)),
-    Crooked("ignores the age of drives", "ttl-drive ttl-noise", TIMED, twist=_ageless("drive")),
-    Crooked("ignores the age of permits", "ttl-permit role-permit", TIMED, twist=_ageless("permit")),
-    Crooked("needs one key only", f"no-permit ttl-permit role-permit {LOST['monitor']}", TIMED,
-            twist=rules(_may_move=_one_key)),
-    Crooked("is not held without a drive", f"no-drive {LOST['controller']}", TIMED,
-            twist=rules(set_points=_free_without_drive)),
-    Crooked("forgets commands too soon", "ttl-drive ttl-permit ttl-noise role-permit", TIMED[:6], twist=_short_lived),
-    Crooked("lives on bad lines", "ttl-noise", TIMED, hears=_noise_refreshes),
-    Crooked("goes on without its controller", LOST["controller"], TIMED[6:], twist=_forgets("controller")),
-    Crooked("goes on without its monitor", LOST["monitor"], TIMED[6:], twist=_forgets("monitor")),
-    Crooked("stops fans with the wheels", "fans-ttl", ("fans-ttl", "fans", "fans-stop"), twist=_fans_stop_with_wheels),
-    Crooked("frames with numbers of their own", "frames-seq", FRAMES[:3],
-            says=each(lambda frame: frame["seq"] % 10 or frame.update(seq=frame["seq"] - 1))),
-    Crooked("frames that are left out", "frames-seq", FRAMES[:3],
-            says=lambda message, _: None if message.get("seq", 1) % 10 == 0 else message),
-    Crooked("frames that come twice", "frames-seq", FRAMES[:3], says=_twice),
-    Crooked("frame numbers of a session", "seq-session", ("seq-session",),
-            says=of("sensors", lambda frame, middle: frame.update(seq=middle.count))),
-    Crooked("obeys permits of the controller", "role-permit", TIMED[:6], twist=_obey(Permit)),
-    Crooked("a time-to-live twice as long", "ttl-drive ttl-permit ttl-noise role-permit", TIMED[:6],
-            twist=lambda loop: setattr(loop.robot.rules, "_ttl_s", 0.5)),
-    Crooked("never says held", "no-permit no-drive", TIMED[:2], says=_command(held=lambda _: False)),
-    Crooked("the drive's age for the permit's", "ttl-permit", ("ttl-permit", "ttl-drive"),
-            says=_command(permit_age=lambda cmd: cmd["age"])),
-    Crooked("drives that do not age", "ttl-drive", ("ttl-permit", "ttl-drive"), says=_command(age=lambda _: 0.0)),
-    Crooked("ages 0.1 s too long", "ttl-drive", ("ttl-drive",), says=_command(age=lambda cmd: cmd["age"] + 0.1)),
-    Crooked("holds 0.15 s after its controller is lost", LOST["controller"], TIMED[6:],
-            twist=around("robot.lose", _loses_late)),
-    Crooked("fans to their floor at each session", "fans-fin fans-rst", ("fans", "fans-fin", "fans-rst"),
-            twist=around("robot.join", _fans_off_when_joined)),
-    Crooked("a clock at half the rate", "clock", ("clock",), says=clock(lambda t_s: 0.5 * t_s)),
-    Crooked("a clock at three times the rate", "clock", ("clock",), says=clock(lambda t_s: 3.0 * t_s)),
-    Crooked("frames that are 0.3 s old", "frames-age", ("frames-age", "echo"), twist=_old_frames),
-    Crooked("wheels go on without permits", "wheels-ttl-permit wheels-lost-monitor",
+    Defect("keeps a role for bad lines", "take-over", ("take-over",), receives=_noise_keeps_the_role),
+    Defect("gives roles away too soon", "take-over", ("take-over",), modify=around("command", _soon_taken_over)),
+    Defect("ignores the age of drives", "ttl-drive ttl-noise", TIMED, modify=_ageless("drive")),
+    Defect("ignores the age of permits", "ttl-permit role-permit", TIMED, modify=_ageless("permit")),
+    Defect("needs one key only", f"no-permit ttl-permit role-permit {LOST['monitor']}", TIMED,
+            modify=rules(_may_move=_one_key)),
+    Defect("is not held without a drive", f"no-drive {LOST['controller']}", TIMED,
+            modify=rules(set_points=_free_without_drive)),
+    Defect("forgets commands too soon", "ttl-drive ttl-permit ttl-noise role-permit", TIMED[:6], modify=_short_lived),
+    Defect("lives on bad lines", "ttl-noise", TIMED, receives=_noise_refreshes),
+    Defect("goes on without its controller", LOST["controller"], TIMED[6:], modify=_forgets("controller")),
+    Defect("goes on without its monitor", LOST["monitor"], TIMED[6:], modify=_forgets("monitor")),
+    Defect("stops fans with the wheels", "fans-ttl", ("fans-ttl", "fans", "fans-stop"), modify=_fans_stop_with_wheels),
+    Defect("frames with numbers of their own", "frames-seq", FRAMES[:3],
+            sends=each(lambda frame: frame["seq"] % 10 or frame.update(seq=frame["seq"] - 1))),
+    Defect("frames that are left out", "frames-seq", FRAMES[:3],
+            sends=lambda message, _: None if message.get("seq", 1) % 10 == 0 else message),
+    Defect("frames that come twice", "frames-seq", FRAMES[:3], sends=_twice),
+    Defect("frame numbers of a session", "seq-session", ("seq-session",),
+            sends=of("sensors", lambda frame, middle: frame.update(seq=middle.count))),
+    Defect("obeys permits of the controller", "role-permit", TIMED[:6], modify=_obey(Permit)),
+    Defect("a time-to-live twice as long", "ttl-drive ttl-permit ttl-noise role-permit", TIMED[:6],
+            modify=lambda loop: setattr(loop.robot.rules, "_ttl_s", 0.5)),
+    Defect("never says held", "no-permit no-drive", TIMED[:2], sends=_command(held=lambda _: False)),
+    Defect("the drive's age for the permit's", "ttl-permit", ("ttl-permit", "ttl-drive"),
+            sends=_command(permit_age=lambda cmd: cmd["age"])),
+    Defect("drives that do not age", "ttl-drive", ("ttl-permit", "ttl-drive"), sends=_command(age=lambda _: 0.0)),
+    Defect("ages 0.1 s too long", "ttl-drive", ("ttl-drive",), sends=_command(age=lambda cmd: cmd["age"] + 0.1)),
+    Defect("holds 0.15 s after its controller is lost", LOST["controller"], TIMED[6:],
+            modify=around("robot.lose", _loses_late)),
+    Defect("fans to their floor at each session", "fans-fin fans-rst", ("fans", "fans-fin", "fans-rst"),
+            modify=around("robot.join", _fans_off_when_joined)),
+    Defect("a clock at half the rate", "clock", ("clock",), sends=clock(lambda t_s: 0.5 * t_s)),
+    Defect("a clock at three times the rate", "clock", ("clock",), sends=clock(lambda t_s: 3.0 * t_s)),
+    Defect("frames that are 0.3 s old", "frames-age", ("frames-age", "echo"), modify=_old_frames),
+    Defect("wheels go on without permits", "wheels-ttl-permit wheels-lost-monitor",
             ("wheels-ttl-permit", "wheels-lost-monitor"),
-            twist=lambda loop: (rules(set_points=_lie)(loop), _forgets("monitor")(loop))),
-    Crooked("says held and turns", "wheels-ttl wheels-lost", ("wheels-ttl", "wheels-lost"),
-            twist=lambda loop: (rules(set_points=_lie)(loop), _forgets("controller")(loop))),
+            modify=lambda loop: (rules(set_points=_lie)(loop), _forgets("monitor")(loop))),
+    Defect("says held and turns", "wheels-ttl wheels-lost", ("wheels-ttl", "wheels-lost"),
+            modify=lambda loop: (rules(set_points=_lie)(loop), _forgets("controller")(loop))),
 ]  # fmt: skip
 
 
 MIRROR = [
-    Crooked("x and y of gravity exchanged", "mirror", AT_BASE, says=_gravity(lambda t, x, y, z: [t, y, x, z])),
-    Crooked("y of gravity of the other sign", "mirror", AT_BASE, says=_gravity(lambda t, x, y, z: [t, x, -y, z])),
-    Crooked("edge values inverted", "mirror", AT_BASE, says=each(_inverted)),
+    Defect("x and y of gravity exchanged", "mirror", AT_BASE, sends=_gravity(lambda t, x, y, z: [t, y, x, z])),
+    Defect("y of gravity of the other sign", "mirror", AT_BASE, sends=_gravity(lambda t, x, y, z: [t, x, -y, z])),
+    Defect("edge values inverted", "mirror", AT_BASE, sends=each(_inverted)),
 ]
 # Nothing on the link shows these: where the robot stands is not known, or how fast a sensor should be.
 UNSEEN = [
-    Crooked("x and y of gravity exchanged, at no known place", "", FRAMES, says=MIRROR[0].says),
-    Crooked("edge values inverted, at no known place", "", FRAMES, says=MIRROR[2].says),
-    Crooked("encoder samples left out", "", (*FRAMES, *STRAIGHT), says=each(lambda f: f["enc"].__delitem__(slice(-1)))),
+    Defect("x and y of gravity exchanged, at no known place", "", FRAMES, sends=MIRROR[0].sends),
+    Defect("edge values inverted, at no known place", "", FRAMES, sends=MIRROR[2].sends),
+    Defect("encoder samples left out", "", (*FRAMES, *STRAIGHT), sends=each(lambda f: f["enc"].__delitem__(slice(-1)))),
 ]
 TABLES = {
     "Hello and join": SESSIONS, "Keys": MACS, "Frames": STREAMS, "Commands": [*COMMANDS, *FLOORS],
@@ -722,15 +722,15 @@ TABLES = {
 
 
 def judge(
-    config: Config, table: list[Crooked], *, lockstep: bool, key: bytes | None = None, mirror: Mirror | None = None
+    config: Config, table: list[Defect], *, lockstep: bool, key: bytes | None = None, mirror: Mirror | None = None
 ) -> None:
     """Each server of a table fails the checks meant for it, and no others."""
     wrong = {}
-    for crooked in table:
-        results = checked(config, crooked.runs, lockstep=lockstep, key=key, crooked=crooked, mirror=mirror)
+    for broken in table:
+        results = checked(config, broken.runs, lockstep=lockstep, key=key, broken=broken, mirror=mirror)
         seen = {result.check_id: result.detail for result in results if result.outcome == "fail"}
-        if set(seen) != set(crooked.fails.split()):
-            wrong[crooked.name] = crooked.fails, seen
+        if set(seen) != set(broken.fails.split()):
+            wrong[broken.name] = broken.fails, seen
     assert not wrong, json.dumps(wrong, indent=1)
 
 
@@ -739,7 +739,7 @@ def judge(
     [SESSIONS, STREAMS, COMMANDS, STEPS, QUANTITIES, RULES, UNSEEN],
     ids=["sessions", "frames", "commands", "steps", "quantities", "rules", "unseen"],
 )
-def test_in_lockstep(config: Config, table: list[Crooked], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_lockstep(config: Config, table: list[Defect], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_checks, "FRAMES", 15)  # whatever is wrong with them is wrong with the first
     judge(config, table, lockstep=True)
 
@@ -761,7 +761,7 @@ def test_in_real_time(config: Config) -> None:
 
 
 def test_every_check_has_its_broken_server() -> None:
-    seeded = [crooked for table in TABLES.values() for crooked in table]
-    found = {name for crooked in seeded for name in crooked.fails.split()}
+    seeded = [broken for table in TABLES.values() for broken in table]
+    found = {name for broken in seeded for name in broken.fails.split()}
     assert set(IDS) - found == {"mac"}  # a server that refuses the right mac lets no check begin
-    assert sum(bool(crooked.fails) for crooked in seeded) > 0.95 * len(seeded) > 60
+    assert sum(bool(broken.fails) for broken in seeded) > 0.95 * len(seeded) > 60
