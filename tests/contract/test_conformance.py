@@ -27,7 +27,7 @@ from ccatp.commissioning.conformance.runner import CHECKS, Conformance, check_id
 from ccatp.commissioning.conformance.server_checks import check_clock, check_edges, check_gravity, line_fault
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
-from tests.contract.crooked import CORRECT, TIMEOUT_S, Defect, Middle, checked, clock, serving
+from tests.contract.defects import CORRECT, TIMEOUT_S, Defect, Middle, checked, clock, serving
 from tests.faults.table import conformance_rows, load_table
 from tests.support.command import refused
 from tests.support.scenario import config_of, mirror_of

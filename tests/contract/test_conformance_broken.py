@@ -18,7 +18,7 @@ from ccatp.links.robot_messages import Drive, Permit, Role
 from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.onboard.rules import MotionRules
-from tests.contract.crooked import Defect, Message, Middle, around, checked, clock, each, of, put, rules, swap
+from tests.contract.defects import Defect, Message, Middle, around, checked, clock, each, of, put, rules, swap
 from tests.support.scenario import SurveyLoop, config_of
 
 KEY = b"secret"
