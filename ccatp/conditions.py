@@ -1,17 +1,17 @@
 """THE table of conditions: everything that slows, pauses, holds, returns or stops the robot, one row per condition.
 
-The danger loop finds the conditions in ``DANGER``. Of several at once the one with the highest severity counts, then
-the first row. Two exceptions for the verdict's cause: that of a declared edge stays unless a hold or a fault is found;
-that of an emergency stays unless a return or a fault is found. A mission, its localizer or the main loop find the
-conditions in ``SURVEY``. The action of a row decides what a mission does; of several actions the first in ``Action``
-counts. ``docs/alarms.md`` is generated from these rows.
+The danger loop may find several conditions at once. The one with the highest severity counts, then the one with the
+lowest number in ``precedence``. Two exceptions for the verdict's cause: that of a declared edge stays unless a hold or
+a fault is found; that of an emergency stays unless a return or a fault is found. Each other owner reports one condition
+at a time. ``docs/alarms.md`` is generated from these rows. A mission may register rows of its own from another file.
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, StrEnum
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import NamedTuple, ParamSpec
 
 from ccatp.core import EventCode, Severity, Verdict
 
@@ -58,6 +58,21 @@ _ALARM_SEVERITY = {
 }
 
 
+class Owner(StrEnum):
+    """The component that finds a condition."""
+
+    DANGER = "danger loop"
+    LOCALIZER = "localizer"
+    MISSION = "mission"
+    FIXES = "fix service"
+    MAIN = "main loop"
+    LINK = "robot link"
+    OPERATOR = "operator"
+
+
+ALONE = 0  # precedence of a condition that its owner never reports together with another one
+
+
 class Group(StrEnum):
     """The chapters of the list of alarms."""
 
@@ -77,7 +92,8 @@ class Group(StrEnum):
 class Condition:
     """One row.
 
-    ``name``: the public name, of alarms and events. ``message``: text of the cause, with "{...}" for variable parts;
+    ``name``: the public name, of alarms and events. ``precedence``: of findings with equal severity the lowest number
+    counts. ``message``: text of the cause, with "{...}" for variable parts;
     ``meaning``: when it applies; ``advice``: what an operator can do. ``severity``: of the verdict; NONE if event code
     and permits express it. ``limit``: key of the configuration with the time after which it has the severity
     ``escalates_to``. ``full_fans``: full fans meanwhile.
@@ -85,6 +101,8 @@ class Condition:
     """
 
     name: str
+    owner: Owner
+    precedence: int
     group: Group
     message: str
     meaning: str
@@ -130,12 +148,26 @@ class MonitorFinding(NamedTuple):
         return Verdict(seq, t_s, code, *shown, False, False, False, severity=self.severity)
 
 
+TABLE: dict[str, Condition] = {}  # all registered rows by name
+P = ParamSpec("P")
+
+
+def registered(make: Callable[P, Condition]) -> Callable[P, Condition]:
+    """A function that makes a row and registers it. Raises ValueError: the name is taken."""
+
+    def row(*args: P.args, **kwargs: P.kwargs) -> Condition:
+        made = make(*args, **kwargs)
+        if made.name in TABLE:
+            raise ValueError(f"conditions: {made.name} is registered twice")
+        TABLE[made.name] = made
+        return made
+
+    return row
+
+
 # Usual fields of a row by its action; a row may override them.
-inform = partial(Condition, action=Action.INFORM, severity=Severity.INFORM, motion=Motion.ANY, clear=Clear.AUTO)
-slow = partial(Condition, action=Action.SLOW, severity=Severity.SLOW, motion=Motion.ANY, clear=Clear.AUTO)
-wait = partial(Condition, action=Action.PAUSE, severity=Severity.PAUSE, motion=Motion.NONE, clear=Clear.AUTO)
-pause = partial(wait, limit="health.pause_limit_s", escalates_to=Severity.HOLD)
-beacon_hold = partial(
+_wait = partial(Condition, action=Action.PAUSE, severity=Severity.PAUSE, motion=Motion.NONE, clear=Clear.AUTO)
+_beacon_hold = partial(
     Condition,
     action=Action.HOLD,
     severity=Severity.HOLD,
@@ -144,12 +176,29 @@ beacon_hold = partial(
     limit="danger.hold_limit_s",
     escalates_to=Severity.FAULT,
 )
-hold = partial(beacon_hold, clear=Clear.AFTER_FIX, limit="health.hold_limit_s")
-go_home = partial(Condition, action=Action.RETURN, severity=Severity.RETURN, motion=Motion.RETURN, clear=Clear.OPERATOR)
-fault = partial(Condition, action=Action.FAULT, severity=Severity.FAULT, motion=Motion.NONE, clear=Clear.OPERATOR)
-shaken = partial(Condition, action=Action.EARTHQUAKE, severity=Severity.NONE, motion=Motion.NONE, clear=Clear.OPERATOR)
-edge = partial(Condition, action=Action.RETREAT, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AFTER_FIX)
-near = partial(Condition, action=Action.KEEP_AWAY, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AUTO)
+inform = registered(
+    partial(Condition, action=Action.INFORM, severity=Severity.INFORM, motion=Motion.ANY, clear=Clear.AUTO)
+)
+slow = registered(partial(Condition, action=Action.SLOW, severity=Severity.SLOW, motion=Motion.ANY, clear=Clear.AUTO))
+wait = registered(_wait)
+pause = registered(partial(_wait, limit="health.pause_limit_s", escalates_to=Severity.HOLD))
+beacon_hold = registered(_beacon_hold)
+hold = registered(partial(_beacon_hold, clear=Clear.AFTER_FIX, limit="health.hold_limit_s"))
+go_home = registered(
+    partial(Condition, action=Action.RETURN, severity=Severity.RETURN, motion=Motion.RETURN, clear=Clear.OPERATOR)
+)
+fault = registered(
+    partial(Condition, action=Action.FAULT, severity=Severity.FAULT, motion=Motion.NONE, clear=Clear.OPERATOR)
+)
+shaken = registered(
+    partial(Condition, action=Action.EARTHQUAKE, severity=Severity.NONE, motion=Motion.NONE, clear=Clear.OPERATOR)
+)
+edge = registered(
+    partial(Condition, action=Action.RETREAT, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AFTER_FIX)
+)
+near = registered(
+    partial(Condition, action=Action.KEEP_AWAY, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AUTO)
+)
 
 
 class SampleRate(NamedTuple):
@@ -176,326 +225,347 @@ SAMPLE_RATES = {
 
 _RATE = "{sensor} deliver {rate} samples/s, at least {least} are needed"
 _FIRMWARE = "Set the rate in the robot's firmware; the sensor and its cable work."
-SENSOR_MUCH_TOO_SLOW = hold("sensor_much_too_slow", Group.SENSORS, _RATE,
+SENSOR_MUCH_TOO_SLOW = hold("sensor_much_too_slow", Owner.DANGER, 10, Group.SENSORS, _RATE,
     "Encoders or edge sensors deliver less than half of what is needed. The robot stands.", _FIRMWARE)
-SENSOR_TOO_SLOW = slow("sensor_too_slow", Group.SENSORS, _RATE,
+SENSOR_TOO_SLOW = slow("sensor_too_slow", Owner.DANGER, 20, Group.SENSORS, _RATE,
     "The sample rate is lower than needed at full speed. The robot continues at half its speed.", _FIRMWARE)
 
 # -- wheels and encoders ----------------------------------------------------------------------------------------------
 
-ENCODER_BROKEN = hold("encoder_broken", Group.WHEELS, "the {side} encoder {what}",
+ENCODER_BROKEN = hold("encoder_broken", Owner.DANGER, 30, Group.WHEELS, "the {side} encoder {what}",
     "One encoder repeats itself, or gives no values, while the wheel must turn. The robot takes a fix and continues; "
     "repeated, it is a fault.", "Check its cable.")
-WHEEL_RUNS_AWAY = hold("wheel_runs_away", Group.WHEELS, "the {side} wheel runs away",
+WHEEL_RUNS_AWAY = hold("wheel_runs_away", Owner.DANGER, 40, Group.WHEELS, "the {side} wheel runs away",
     "It turns faster than commanded.", "Remove the robot: the servo fails.")
-WHEEL_SPEED_WRONG = hold("wheel_speed_wrong", Group.WHEELS, "the {side} wheel turns {ratio} times as fast as commanded",
+WHEEL_SPEED_WRONG = hold("wheel_speed_wrong", Owner.DANGER, 50, Group.WHEELS,
+    "the {side} wheel turns {ratio} times as fast as commanded",
     "By regression over `health.ratio_time_s`, the speed by its encoder is not within 1 +- `health.ratio_share` of the "
     "commanded one. The robot takes a fix; repeated, it is a fault.",
     "Check gain and supply of the servo, the encoder's counts per turn, and the wheel radius in the firmware.")
-WHEELS_STAND = hold("wheels_stand", Group.WHEELS, "both wheels stand, or no encoder counts",
+WHEELS_STAND = hold("wheels_stand", Owner.DANGER, 60, Group.WHEELS, "both wheels stand, or no encoder counts",
     "They were commanded to turn. The motor supply or both encoders fail.",
     "Check the robot's supply and its own log.", retries=1)
-ENCODER_COUNTS_NOTHING = hold("encoder_counts_nothing", Group.WHEELS, "the {side} encoder counts nothing",
+ENCODER_COUNTS_NOTHING = hold("encoder_counts_nothing", Owner.DANGER, 70, Group.WHEELS,
+    "the {side} encoder counts nothing",
     "By the gyroscope the wheel turns, by its encoder it does not.", "Check the encoder's cable and disc.", retries=1)
-WHEEL_BLOCKED = hold("wheel_blocked", Group.WHEELS, "the {side} wheel is blocked",
+WHEEL_BLOCKED = hold("wheel_blocked", Owner.DANGER, 80, Group.WHEELS, "the {side} wheel is blocked",
     "It was commanded to turn and stands still; the gyroscope agrees.", "Look for an obstacle.", retries=1)
-WHEEL_CREEPS = hold("wheel_creeps", Group.WHEELS, "the {side} wheel turns while it is held",
+WHEEL_CREEPS = hold("wheel_creeps", Owner.DANGER, 90, Group.WHEELS, "the {side} wheel turns while it is held",
     "The robot creeps. Fans to their maximum; a fault if it continues.", "Hold the robot; check fans, brake, slope.",
     full_fans=True)
-WHEEL_CREEPS_ON = fault("wheel_creeps_on", Group.WHEELS, "the {side} wheel turns while it is held",
+WHEEL_CREEPS_ON = fault("wheel_creeps_on", Owner.DANGER, 100, Group.WHEELS, "the {side} wheel turns while it is held",
     "The robot has crept for a second. Fans to their maximum.",
     "Hold the robot; check fans, brake, slope.", full_fans=True)
-WHEEL_DOES_NOT_STOP = hold("wheel_does_not_stop", Group.WHEELS, "the {side} wheel turns though it shall stand",
+WHEEL_DOES_NOT_STOP = hold("wheel_does_not_stop", Owner.DANGER, 110, Group.WHEELS,
+    "the {side} wheel turns though it shall stand",
     "The servo does not come to rest.", "If it repeats, remove the robot: the servo fails.")
-GRIP_LOST = hold("grip_lost", Group.WHEELS, "the robot loses its grip: it slides downhill over its wheels",
+GRIP_LOST = hold("grip_lost", Owner.DANGER, 120, Group.WHEELS,
+    "the robot loses its grip: it slides downhill over its wheels",
     "Accelerometer and gyroscope show a slide along gravity, its wheels do not. Wheels held, fans to their maximum; "
     "a fault if it slides again within `health.retry_window_s`.",
     "Tyres or mirror oily? Too little thrust for the slope: see `ccatp plan`.", full_fans=True, retries=0)
-GRIP_TOO_LITTLE = fault("grip_too_little", Group.WHEELS,
+GRIP_TOO_LITTLE = fault("grip_too_little", Owner.DANGER, 130, Group.WHEELS,
     "too little grip by the creep of turns: the fans do not hold it everywhere",
     "The friction measured in turns, at the start and at each fix after a turn, is too small even for full thrust.",
     "Tyres or mirror oily? Clean them, or raise the thrust; `ccatp status` shows the friction. Wrong `robot.tyre_m`?",
     full_fans=True)
-GRIP_LITTLE = slow("grip_little", Group.WHEELS, "little grip by the creep of turns: less than `robot.thrust_margin`",
+GRIP_LITTLE = slow("grip_little", Owner.DANGER, 140, Group.WHEELS,
+    "little grip by the creep of turns: less than `robot.thrust_margin`",
     "The same, but full thrust still holds the robot. More thrust, half the speed.",
     "Tyres or mirror oily? Clean them, or raise the thrust. It ends when turns creep less.")
-YAW_DISAGREES = hold("yaw_disagrees", Group.SENSORS,
+YAW_DISAGREES = hold("yaw_disagrees", Owner.DANGER, 150, Group.SENSORS,
     "gyroscope and wheels disagree about the turn: a wheel slips, or the gyroscope is off",
     "They disagree by more than slip and scale errors explain. The robot takes a fix.",
     "Wheels or mirror oily? Otherwise check the gyroscope.")
 
 # -- fans -------------------------------------------------------------------------------------------------------------
 
-FAN_TOO_LITTLE = fault("fan_too_little", Group.FANS, "the {side} fan gives too little",
+FAN_TOO_LITTLE = fault("fan_too_little", Owner.DANGER, 160, Group.FANS, "the {side} fan gives too little",
     "Not enough to carry the robot with certainty. Wheels held, fans to their maximum.",
     "Secure the robot by hand before anything else.", full_fans=True)
-FAN_WEAK = go_home("fan_weak", Group.FANS, "the {side} fan gets weak",
+FAN_WEAK = go_home("fan_weak", Owner.DANGER, 170, Group.FANS, "the {side} fan gets weak",
     "It gives less than commanded, but enough to carry the robot. The robot goes home.",
     "Replace it; `ccatp run --resume` later.", full_fans=True)
-FAN_REPORTED = fault("fan_reported", Group.FANS, "the robot reports a fault of its {side} fan",
+FAN_REPORTED = fault("fan_reported", Owner.DANGER, 180, Group.FANS, "the robot reports a fault of its {side} fan",
     "The robot reports it; handled like too little thrust.", "Secure the robot.", full_fans=True)
-FAN_REPORTED_ON_THE_FLAT = inform("fan_reported_on_the_flat", Group.FANS, "the robot reports a fault of its {side} fan",
+FAN_REPORTED_ON_THE_FLAT = inform("fan_reported_on_the_flat", Owner.DANGER, 190, Group.FANS,
+    "the robot reports a fault of its {side} fan",
     "The same where the mirror does not overhang: the robot stands without fans.",
     "Replace it before the robot goes to an overhanging mirror.")
 
 # -- link and clock ---------------------------------------------------------------------------------------------------
 
-DRIVES_TOO_LATE = pause("drives_too_late", Group.LINK, "drives reach the wheels too late",
+DRIVES_TOO_LATE = pause("drives_too_late", Owner.DANGER, 200, Group.LINK, "drives reach the wheels too late",
     "Commands take so long that the robot cannot be steered: a pause.", "Check the network.")
-DRIVES_LATE = slow("drives_late", Group.LINK, "drives reach the wheels late",
+DRIVES_LATE = slow("drives_late", Owner.DANGER, 210, Group.LINK, "drives reach the wheels late",
     "Commands take long. Half the speed.", "Check the network.")
-CLOCK_JUMPED = pause("clock_jumped", Group.LINK, "the robot's clock has jumped",
+CLOCK_JUMPED = pause("clock_jumped", Owner.DANGER, 220, Group.LINK, "the robot's clock has jumped",
     "Its times are off by more than `health.clock_jump_s`. The clock's offset is measured again.",
     "Nothing, unless it repeats.")
-SAMPLES_MISDATED = inform("samples_misdated", Group.LINK, "samples of the {sensor} are {side} their frame: not used",
+SAMPLES_MISDATED = inform("samples_misdated", Owner.DANGER, 230, Group.LINK,
+    "samples of the {sensor} are {side} their frame: not used",
     "A sample is later than its frame by more than 1 ms, or older by more than 1 s, so its time is not known. What is "
     "not used is missing: see the alarms about samples that are stale.",
     "Check how the firmware stamps its samples. After a stall of the robot's computer nothing, unless it repeats.")
-FRAMES_LOST = hold("frames_lost", Group.DATA, "frames were lost while the robot may have moved",
+FRAMES_LOST = hold("frames_lost", Owner.DANGER, 240, Group.DATA, "frames were lost while the robot may have moved",
     "A gap in the frames while the robot moved. The robot takes a fix.", "If it repeats, check the network.")
-LINES_GARBLED = hold("lines_garbled", Group.DATA, "lines of the robot were no frames",
+LINES_GARBLED = hold("lines_garbled", Owner.DANGER, 250, Group.DATA, "lines of the robot were no frames",
     "Several lines in a short time could not be read.",
     "Check network and firmware. `ccatp conformance` reports what is wrong in the robot's messages.")
 
 # -- edge sensors and inertial unit -----------------------------------------------------------------------------------
 
-EDGE_SENSOR_CHATTERS = hold("edge_sensor_chatters", Group.SENSORS, "an edge sensor chatters",
+EDGE_SENSOR_CHATTERS = hold("edge_sensor_chatters", Owner.DANGER, 260, Group.SENSORS, "an edge sensor chatters",
     "It changes many times a second where the map has no edge.", "Clean it; check its cable.")
-EDGE_SENSOR_FLASHES = pause("edge_sensor_flashes", Group.SENSORS, "an edge sensor went off though nothing moved",
+EDGE_SENSOR_FLASHES = pause("edge_sensor_flashes", Owner.DANGER, 270, Group.SENSORS,
+    "an edge sensor went off though nothing moved",
     "Light fell on it, or it fails.", "Nothing, unless it repeats. Stray light: cover the place.")
-EDGE_SENSOR_STAYS_DARK = slow("edge_sensor_stays_dark", Group.SENSORS, "an edge sensor went off though nothing moved",
+EDGE_SENSOR_STAYS_DARK = slow("edge_sensor_stays_dark", Owner.DANGER, 280, Group.SENSORS,
+    "an edge sensor went off though nothing moved",
     "It stays off for longer than a pause may last: the edge rule decides, at half the speed.",
     "Clean or replace it. Stray light: cover the place.")
-IMU_LEFT_OUT = slow("imu_left_out", Group.SENSORS, "{what}: left out",
+IMU_LEFT_OUT = slow("imu_left_out", Owner.DANGER, 290, Group.SENSORS, "{what}: left out",
     "Readings of the inertial unit are impossible (stuck, at their limit, a jump). It is not used: wheels alone, at "
     "half the speed.", "The accuracy is lower. Replace it if this does not end.")
-ACCELEROMETER_DIFFERENCES = inform("accelerometer_differences", Group.SENSORS,
+ACCELEROMETER_DIFFERENCES = inform("accelerometer_differences", Owner.DANGER, 300, Group.SENSORS,
     "the accelerometer's samples are single differences, no means: they show contacts as motion",
     "More than twenty jumps in speed within about 20 s that the next sample does not take back. A slide counts with at "
     "most 2 m/s² and against the noise, so it is found later; the position is less accurate.",
     "The robot's firmware must send `ax` as a mean over at least the time between two samples.")
-SAMPLES_TOO_FEW = slow("samples_too_few", Group.SENSORS, "a sensor gives too few samples",
+SAMPLES_TOO_FEW = slow("samples_too_few", Owner.DANGER, 310, Group.SENSORS, "a sensor gives too few samples",
     "One sensor is slower than usual. The robot continues at half its speed.", "See the robot's own log.")
 
 # -- battery ----------------------------------------------------------------------------------------------------------
 
-BATTERY_LOW = go_home("battery_low", Group.FANS, "the battery has to last for the way home",
+BATTERY_LOW = go_home("battery_low", Owner.DANGER, 320, Group.FANS, "the battery has to last for the way home",
     "The charge is enough for the way home with its reserve, but not for more. The robot goes home.",
     "Charge it; `ccatp run --resume` later.")
-BATTERY_REPORTED = go_home("battery_reported", Group.FANS, "the robot reports a low battery",
+BATTERY_REPORTED = go_home("battery_reported", Owner.DANGER, 330, Group.FANS, "the robot reports a low battery",
     "The robot reports it, and goes home.", "Charge it; `ccatp run --resume` later.")
 
 # -- seams ------------------------------------------------------------------------------------------------------------
 
-EDGE_SENSOR_BLIND = hold("edge_sensor_blind", Group.SENSORS, "an edge sensor sees no seams: blind",
+EDGE_SENSOR_BLIND = hold("edge_sensor_blind", Owner.DANGER, 340, Group.SENSORS, "an edge sensor sees no seams: blind",
     "It would not detect the rim either.", "Clean or replace it before `ccatp resume`.", retries=0)
-SEAM_MISSED = slow("seam_missed", Group.SENSORS, "an edge sensor did not see a seam",
+SEAM_MISSED = slow("seam_missed", Owner.DANGER, 350, Group.SENSORS, "an edge sensor did not see a seam",
     "It crossed a seam without a signal. The robot continues at half its speed.",
     "Clean it; the second missed seam holds the robot.")
 
 # -- what the robot reports of itself ---------------------------------------------------------------------------------
 
-ENCODER_REPORTED = hold("encoder_reported", Group.WHEELS, "the robot reports a fault of its {side} encoder",
+ENCODER_REPORTED = hold("encoder_reported", Owner.DANGER, 360, Group.WHEELS,
+    "the robot reports a fault of its {side} encoder",
     "The robot reports it.", "See the robot's own log.")
-EDGE_REPORTED = hold("edge_reported", Group.WHEELS, "the robot reports a fault of its edge sensors",
+EDGE_REPORTED = hold("edge_reported", Owner.DANGER, 370, Group.WHEELS, "the robot reports a fault of its edge sensors",
     "The robot reports it.", "See the robot's own log.")
-STALL_REPORTED = hold("stall_reported", Group.WHEELS, "the robot reports that a wheel is blocked",
+STALL_REPORTED = hold("stall_reported", Owner.DANGER, 380, Group.WHEELS, "the robot reports that a wheel is blocked",
     "The robot reports it.", "Look for an obstacle.")
-IMU_REPORTED = slow("imu_reported", Group.WHEELS, "the robot reports a fault of its inertial unit",
+IMU_REPORTED = slow("imu_reported", Owner.DANGER, 390, Group.WHEELS, "the robot reports a fault of its inertial unit",
     "The robot reports it. Half the speed.", "See the robot's own log.")
-UNKNOWN_REPORTED = inform("unknown_reported", Group.WHEELS, "the robot reports a fault that is not known here",
+UNKNOWN_REPORTED = inform("unknown_reported", Owner.DANGER, 400, Group.WHEELS,
+    "the robot reports a fault that is not known here",
     "The firmware is newer than this program. It is only reported.", "See the robot's manual.")
 
 # -- data that are missing or old -------------------------------------------------------------------------------------
 
-NO_FRAME = pause("no_frame", Group.DATA, "no sensors frame",
+NO_FRAME = pause("no_frame", Owner.DANGER, 410, Group.DATA, "no sensors frame",
     "The danger loop receives no frames from the robot.",
     "Is the robot on, the network up? See the link's alarms below.")
-NO_EDGE_SAMPLES = pause("no_edge_samples", Group.DATA, "no edge samples",
+NO_EDGE_SAMPLES = pause("no_edge_samples", Owner.DANGER, 420, Group.DATA, "no edge samples",
     "Frames arrive without edge samples.", "Check the robot's sensor board and its own log.")
-EDGE_STALE = pause("edge_stale", Group.DATA, "edge samples stale",
+EDGE_STALE = pause("edge_stale", Owner.DANGER, 430, Group.DATA, "edge samples stale",
     "Frames arrive with old edge samples.", "Check the robot's sensor board and its own log.")
-ENCODERS_STALE = hold("encoders_stale", Group.DATA, "encoder samples stale",
+ENCODERS_STALE = hold("encoders_stale", Owner.DANGER, 440, Group.DATA, "encoder samples stale",
     "No encoder samples arrive. Held until a fix, because the robot's motion is not known.",
     "Check the robot's encoders; if it repeats, remove the robot.")
-NO_ESTIMATE = pause("no_estimate", Group.DATA, "no estimate",
+NO_ESTIMATE = pause("no_estimate", Owner.DANGER, 450, Group.DATA, "no estimate",
     "Main has not reported where the robot is: at the start, or while main is restarted.", "Nothing, unless it lasts.")
-ESTIMATE_STALE = pause("estimate_stale", Group.DATA, "estimate stale",
+ESTIMATE_STALE = pause("estimate_stale", Owner.DANGER, 460, Group.DATA, "estimate stale",
     "Main is too slow or hangs.",
     "Is something else busy on this machine? The supervisor restarts a main that hangs after two seconds.")
-ESTIMATE_NOT_FINITE = pause("estimate_not_finite", Group.DATA, "estimate not finite",
+ESTIMATE_NOT_FINITE = pause("estimate_not_finite", Owner.DANGER, 470, Group.DATA, "estimate not finite",
     "Main's estimate is not a number.", "Keep the run directory: this is a defect of ccatp.")
 
 # -- edges and emergencies --------------------------------------------------------------------------------------------
 
-LIFTED = hold("lifted", Group.EDGES, "all edge sensors off: lifted or fallen",
+LIFTED = hold("lifted", Owner.DANGER, 480, Group.EDGES, "all edge sensors off: lifted or fallen",
     "All four edge sensors are off at once.",
     "Look at the robot before anything else. On an overhanging mirror the fans are at their maximum; do not cut their "
     "power. `ccatp resume` when it stands on the mirror again; it takes a fix first.",
     limit='health.lifted_limit_s', full_fans=True)
-ALL_OFF = edge("all_off", Group.EDGES, "lifted or fallen",
+ALL_OFF = edge("all_off", Owner.DANGER, 490, Group.EDGES, "lifted or fallen",
     "All four edge sensors are off, in the first frame: code 1, no motion is permitted.",
     "Look at the robot before anything else; do not cut the power of its fans.", action=Action.WAIT, motion=Motion.NONE)
-EDGE_SENSOR_STAYS_OFF = hold("edge_sensor_stays_off", Group.SENSORS,
+EDGE_SENSOR_STAYS_OFF = hold("edge_sensor_stays_off", Owner.DANGER, 500, Group.SENSORS,
     "an edge sensor stays off though it was moved back and the others are on",
     "The sensor fails, unless a fix, taken at once, shows a seam or the rim there: then the robot continues by itself.",
     "Clean or replace it. `ccatp resume` continues if it is on again.", action=Action.LOCATE)
-RIM_AHEAD = edge("rim_ahead", Group.EDGES, "rim ahead on the map",
+RIM_AHEAD = edge("rim_ahead", Owner.DANGER, 510, Group.EDGES, "rim ahead on the map",
     "A sensor hangs over where the map has the rim.",
     "Nothing. If it repeats there: is the robot's pose plausible, is the base where the configuration has it?")
-BEYOND_SEAM = edge("beyond_seam", Group.EDGES, "further off the panel than the seam is wide",
+BEYOND_SEAM = edge("beyond_seam", Owner.DANGER, 520, Group.EDGES, "further off the panel than the seam is wide",
     "A sensor has been off over a longer way than the gap of the map there.",
     "Is a panel missing, or the gap wider than `mirror.panels.gap_mm`?")
-NO_SEAM = edge("no_seam", Group.EDGES, "off the panel where the map has no seam",
+NO_SEAM = edge("no_seam", Owner.DANGER, 530, Group.EDGES, "off the panel where the map has no seam",
     "A sensor went off in the middle of a panel: a hole, a dark spot, or a pose that is wrong.",
     "Look at the place. A dirty sensor does this everywhere, a wrong pose near seams.")
-OFF_WITHOUT_WHEELS = edge("off_without_wheels", Group.EDGES, "off the panel while no encoder samples are received",
+OFF_WITHOUT_WHEELS = edge("off_without_wheels", Owner.DANGER, 540, Group.EDGES,
+    "off the panel while no encoder samples are received",
     "A sensor is off, and the distance that the robot has moved is not known.",
     "See the encoder's alarm.")
-CENTRE_NEAR_RIM = edge("centre_near_rim", Group.EDGES, "the robot's centre is close to the rim on the map",
+CENTRE_NEAR_RIM = edge("centre_near_rim", Owner.DANGER, 550, Group.EDGES,
+    "the robot's centre is close to the rim on the map",
     "By its pose the robot is about to drive over the rim; no sensor has gone off yet.",
     "Is the pose plausible? If the robot is elsewhere: `ccatp stop`, carry it to base, remove `checkpoint`, "
     "`--resume`.")
-EARTHQUAKE = shaken("earthquake", Group.OBSERVATORY, "emergency: earthquake",
+EARTHQUAKE = shaken("earthquake", Owner.DANGER, 560, Group.OBSERVATORY, "emergency: earthquake",
     "Held, fans at their maximum, until it is cleared; then home.",
     "Clear it when its cause is gone and the robot is at base or held.")
-EMERGENCY = go_home("emergency", Group.OBSERVATORY, "emergency: {kind}",
+EMERGENCY = go_home("emergency", Owner.DANGER, 570, Group.OBSERVATORY, "emergency: {kind}",
     "Fire, power, weather or an operator's emergency: the robot goes home at once.",
     "Clear it when its cause is gone and the robot is at base or held.", severity=Severity.NONE)
 
 # -- among beacons ----------------------------------------------------------------------------------------------------
 
-RADIO_SILENT = beacon_hold("radio_silent", Group.BEACONS, "no beacon is received",
+RADIO_SILENT = beacon_hold("radio_silent", Owner.DANGER, 580, Group.BEACONS, "no beacon is received",
     "No reading of a beacon for `danger.radio_timeout_s`.", "Check the robot's radio and the beacons' supply.")
-NO_FRESH_ESTIMATE = beacon_hold("no_fresh_estimate", Group.BEACONS, "no fresh estimate",
+NO_FRESH_ESTIMATE = beacon_hold("no_fresh_estimate", Owner.DANGER, 590, Group.BEACONS, "no fresh estimate",
     "Main has not reported where the robot is for `danger.estimate_timeout_s`.",
     "Is something else busy on this machine?")
-POSITION_UNCERTAIN = beacon_hold("position_uncertain", Group.BEACONS, "the position is too uncertain",
+POSITION_UNCERTAIN = beacon_hold("position_uncertain", Owner.DANGER, 600, Group.BEACONS,
+    "the position is too uncertain",
     "Its standard deviation is above `danger.position_sigma_m`. It ends below `danger.position_clear_m`.",
     "Nothing, unless it lasts: beacons may fail.")
-OBSTACLE_AHEAD = near("obstacle_ahead", Group.BEACONS, "an obstacle ahead",
+OBSTACLE_AHEAD = near("obstacle_ahead", Owner.DANGER, 610, Group.BEACONS, "an obstacle ahead",
     "An echo is nearer than `danger.obstacle_m` on the course. Code 1.", "Nothing: the robot drives around it.")
-TARGET_NEAR = near("target_near", Group.BEACONS, "the target is too near",
+TARGET_NEAR = near("target_near", Owner.DANGER, 620, Group.BEACONS, "the target is too near",
     "By its level, the followed radio is nearer than `danger.target_m`. Code 1.",
     "Nothing: the robot waits until it is farther away.")
-OBSTACLE_BEHIND = near("obstacle_behind", Group.BEACONS, "an obstacle behind",
+OBSTACLE_BEHIND = near("obstacle_behind", Owner.DANGER, 630, Group.BEACONS, "an obstacle behind",
     "An echo is nearer than `danger.obstacle_m` behind the robot: no reverse. Code 1.", "Nothing.")
 
-DANGER: tuple[Condition, ...] = tuple(row for row in list(globals().values()) if isinstance(row, Condition))
-PRECEDENCE = {row: -number for number, row in enumerate(DANGER)}
 
 # == conditions that a mission, its localizer or the main loop finds ==================================================
 
-BACK_OFFS = fault("back_offs", Group.EDGES, "at the edge again after {count} back-offs: is an edge sensor dirty?",
+BACK_OFFS = fault("back_offs", Owner.MISSION, ALONE, Group.EDGES,
+    "at the edge again after {count} back-offs: is an edge sensor dirty?",
     "The way to the same point ends at an edge again and again.",
     "Clean the sensors, look at the place; `ccatp resume`, or abort.")
-STUCK_AT_EDGE = hold("stuck_at_edge", Group.EDGES,
+STUCK_AT_EDGE = hold("stuck_at_edge", Owner.MISSION, ALONE, Group.EDGES,
     "stuck at the edge: no motion away from it is permitted, or none helps",
     "The edge sensors bar every direction.",
     "Look at the robot. It tries again by itself as soon as a sensor is back on.",
     action=Action.WAIT, clear=Clear.AUTO)
 
-NO_FRAME_FOR = wait("no_frame_for", Group.DATA, "no sensors frame for {age_s:.2f} s",
+NO_FRAME_FOR = wait("no_frame_for", Owner.MAIN, ALONE, Group.DATA, "no sensors frame for {age_s:.2f} s",
     "The main loop receives no frames from the robot.", "Is the robot on, the network up?")
-NO_VERDICT = pause("no_verdict", Group.DATA, "no fresh verdict from the danger loop",
+NO_VERDICT = pause("no_verdict", Owner.MAIN, ALONE, Group.DATA, "no fresh verdict from the danger loop",
     "The danger loop is too slow, hangs, or is being restarted.",
     "Is something else busy on this machine? The supervisor restarts a danger loop that hangs.")
-FRAME_LATE = pause("frame_late", Group.DATA, "a frame was served {late_ms:.0f} ms late (limit {limit_ms:.0f} ms)",
+FRAME_LATE = pause("frame_late", Owner.MAIN, ALONE, Group.DATA,
+    "a frame was served {late_ms:.0f} ms late (limit {limit_ms:.0f} ms)",
     "This machine was too slow for one frame.",
     "Nothing, unless it repeats: other programs, or no real-time rights (`no real time` in `log.jsonl`).")
-FRAMES_OLD = pause("frames_old", Group.DATA, "frames are {late_ms:.0f} ms old (limit {limit_ms:.0f} ms)",
+FRAMES_OLD = pause("frames_old", Owner.MAIN, ALONE, Group.DATA,
+    "frames are {late_ms:.0f} ms old (limit {limit_ms:.0f} ms)",
     "By the robot's echo of the drives, frames or drives are delayed by this time in the network or a queue.",
     "Check the network and the load of the robot's computer.")
 
-UNATTENDED_FAULT = go_home("unattended_fault", Group.FANS,
+UNATTENDED_FAULT = go_home("unattended_fault", Owner.MISSION, ALONE, Group.FANS,
     "unattended fault: the battery ({charge:.0%}) lasts for little more than the way home",
     "Held on an overhanging mirror, and no operator has reacted: it goes home by itself, once.",
     "Attend to held robots; a fault is reported every minute.")
-FANS_REFUSED = fault("fans_refused", Group.FANS, "fan command refused: {why}; set robot.fan_duty",
+FANS_REFUSED = fault("fans_refused", Owner.MISSION, ALONE, Group.FANS, "fan command refused: {why}; set robot.fan_duty",
     "The robot would fall with the configured duty of its fans.", "Correct the configuration; start again.")
 
-LINK_LOST = wait("link_lost", Group.LINK, "robot link lost: {reason}",
+LINK_LOST = wait("link_lost", Owner.LINK, ALONE, Group.LINK, "robot link lost: {reason}",
     "The connection ended. The robot holds its wheels by itself; main reconnects for `robot.reconnect_timeout_s`.",
     "Check network and robot. After that time the run ends with status 5; `--resume` continues it.",
     clear=Clear.AFTER_FIX)
-FRAMES_BACKWARD = hold("frames_backward", Group.LINK, "time stamps of the frames run backward",
+FRAMES_BACKWARD = hold("frames_backward", Owner.LOCALIZER, ALONE, Group.LINK, "time stamps of the frames run backward",
     "Five in a row. The robot is held.", "Check the clock of the firmware.", limit='health.retries')
-SENSOR_BACKWARD = hold("sensor_backward", Group.LINK, "time stamps of the {sensor} run backward",
+SENSOR_BACKWARD = hold("sensor_backward", Owner.LOCALIZER, ALONE, Group.LINK,
+    "time stamps of the {sensor} run backward",
     "The same for one sensor.", "Check the clock of the firmware.", limit='health.retries')
 
-LEG_OVERDUE = fault("leg_overdue", Group.SURVEY,
+LEG_OVERDUE = fault("leg_overdue", Owner.MISSION, ALONE, Group.SURVEY,
     "the leg to ({x_m:.3f}, {y_m:.3f}) m is overdue: is a wheel blocked or slipping?",
     "It takes many times longer than it should.", "Look at the robot.")
-NO_REST = fault("no_rest", Group.SURVEY, "the robot does not come to rest: {v_m_s:.4f} m/s, {omega_rad_s:.4f} rad/s",
+NO_REST = fault("no_rest", Owner.MISSION, ALONE, Group.SURVEY,
+    "the robot does not come to rest: {v_m_s:.4f} m/s, {omega_rad_s:.4f} rad/s",
     "It should stand at a point, but moves.", "Shaking fans, or a slippery slope?")
-NO_WAY_ON = fault("no_way_on", Group.SURVEY, "no way on: {why}",
+NO_WAY_ON = fault("no_way_on", Owner.MISSION, ALONE, Group.SURVEY, "no way on: {why}",
     "From where it stands no safe way leads to the next point.",
     "`ccatp abort`; if there is no way home either, carry it.")
-NO_WAY_HOME = fault("no_way_home", Group.SURVEY, "no way home: {why}",
+NO_WAY_HOME = fault("no_way_home", Owner.MISSION, ALONE, Group.SURVEY, "no way home: {why}",
     "From where it stands no safe way leads to base.", "Carry it to base.")
-TIME_USED_UP = go_home("time_used_up", Group.SURVEY, "the time budget of {budget_s:g} s is used up",
+TIME_USED_UP = go_home("time_used_up", Owner.MISSION, ALONE, Group.SURVEY,
+    "the time budget of {budget_s:g} s is used up",
     "The way home would use the rest of it.", "Nothing; `ccatp run --resume` measures the remaining points.")
-MEASUREMENTS_FAILED = fault("measurements_failed", Group.SURVEY, "{count} measurements in a row failed: {why}",
+MEASUREMENTS_FAILED = fault("measurements_failed", Owner.MISSION, ALONE, Group.SURVEY,
+    "{count} measurements in a row failed: {why}",
     "The laser system does not see the puck; the reason is after the colon.",
     "Check laser, line of sight and cleanliness of the puck; `ccatp resume`.")
-NOT_FOUND = fault("not_found", Group.SURVEY, "the robot cannot be found again: {why}",
+NOT_FOUND = fault("not_found", Owner.MISSION, ALONE, Group.SURVEY, "the robot cannot be found again: {why}",
     "Its pose is not trusted, and no fix determines its place.", "Check laser and line of sight; `ccatp resume`.")
-FRAME_REFUSED = fault("frame_refused", Group.SURVEY,
+FRAME_REFUSED = fault("frame_refused", Owner.FIXES, ALONE, Group.SURVEY,
     "the laser system sees the robot {distance_m:.2f} m from {place}: {why}",
     "A fix at the start or on the way lies where the robot cannot be: the laser system has another frame.",
     "Check the configured collimators, base and start of the robot.")
-LASER_NOT_READY = wait("laser_not_ready", Group.SURVEY, "the laser system is not ready (laserready_0)",
+LASER_NOT_READY = wait("laser_not_ready", Owner.FIXES, ALONE, Group.SURVEY,
+    "the laser system is not ready (laserready_0)",
     "Its lasers are not warm. The robot waits at its point; no point is skipped.",
     "Wait, or look at the laser unit; `ccatp check` shows it as well.")
-LASER_NOT_FOLLOWING = fault("laser_not_following", Group.SURVEY,
+LASER_NOT_FOLLOWING = fault("laser_not_following", Owner.FIXES, ALONE, Group.SURVEY,
     "the laser does not follow the robot: its fixes of {count} standstills agree, and encoders and gyroscope moved",
     "The lengths are those of one place (with noise) while wheels and gyroscope show motion: the laser measures "
     "another reflector or delivers old lengths. None of these fixes is used.",
     "Point the beams at the puck or restart the laser's driver; then `ccatp resume`: it takes a fix. `ccatp abort` "
     "sends the robot home by odometry.")
-METROLOGY_UNRELIABLE = inform("metrology_unreliable", Group.SURVEY,
+METROLOGY_UNRELIABLE = inform("metrology_unreliable", Owner.FIXES, ALONE, Group.SURVEY,
     "the lengths of {count} points in a row contradict each other: channels {channels}",
     "The fixes navigate the robot, but are no measurement of the panels: these points are marked unreliable.",
     "Check the beams, the reflector and the air data of the laser system. Measure the points again.")
-LENGTHS_REFUSED = fault("lengths_refused", Group.SURVEY,
+LENGTHS_REFUSED = fault("lengths_refused", Owner.FIXES, ALONE, Group.SURVEY,
     "the laser system's lengths do not lead to the robot's base: {why}",
     "The lengths of the first fix give no position.", "Check the configured collimators and base.")
-FILTER_DIVERGED = hold("filter_diverged", Group.SURVEY, "filter: {why}",
+FILTER_DIVERGED = hold("filter_diverged", Owner.LOCALIZER, ALONE, Group.SURVEY, "filter: {why}",
     "The estimate is not a valid Gaussian any more. The pose is frozen until the next fix.",
     "If it repeats, keep the run directory.", limit='health.retries')
 
-FRAMES_MISSED = fault("frames_missed", Group.BEACONS,
+FRAMES_MISSED = fault("frames_missed", Owner.MISSION, ALONE, Group.BEACONS,
     "no frames while the robot moved: put it at its start and start a new mission",
     "The robot booted, or the link was away while it may have moved; the map of the beacons is not kept.",
     "`ccatp stop`, put it at its start, start again.")
-MISSION_TOO_LONG = fault("mission_too_long", Group.BEACONS,
+MISSION_TOO_LONG = fault("mission_too_long", Owner.MISSION, ALONE, Group.BEACONS,
     "the mission takes longer than mission.time_limit_s = {limit_s:g}",
     "The robot is held where it is.", "`ccatp abort` sends it home; or configure a longer time.")
 
-FIX_NOT_STORED = fault("fix_not_stored", Group.STORAGE, "the fix of {point} cannot be stored: {why}",
+FIX_NOT_STORED = fault("fix_not_stored", Owner.FIXES, ALONE, Group.STORAGE,
+    "the fix of {point} cannot be stored: {why}",
     "The disk is full or broken, or another program locks the database.",
     "Make room, or end that program; `ccatp resume` measures the point again. Once a write has failed nothing more is "
     "written: `ccatp stop`, then `ccatp run --resume`.")
-SKIP_NOT_STORED = fault("skip_not_stored", Group.STORAGE, "that {point} is skipped cannot be stored: {why}",
+SKIP_NOT_STORED = fault("skip_not_stored", Owner.FIXES, ALONE, Group.STORAGE,
+    "that {point} is skipped cannot be stored: {why}",
     "The disk is full or broken, or another program locks the database.",
     "Make room, or end that program; then `ccatp stop` and `ccatp run --resume`.")
-DISK_STALLS = fault("disk_stalls", Group.STORAGE, "the disk stalls: {point} is not stored after {time_s:g} s",
+DISK_STALLS = fault("disk_stalls", Owner.FIXES, ALONE, Group.STORAGE,
+    "the disk stalls: {point} is not stored after {time_s:g} s",
     "The disk does not answer.", "Check the disk; then `ccatp resume`.")
 
-OPERATOR = go_home("operator", Group.OBSERVATORY, "operator",
+OPERATOR = go_home("operator", Owner.OPERATOR, ALONE, Group.OBSERVATORY, "operator",
     "An operator called the robot home, or paused it: then it is held.",
     "`ccatp resume` after a pause; otherwise nothing, a new survey measures the remaining points.",
     severity=Severity.NONE)
 # fmt: on
-
-SURVEY = tuple(row for row in list(globals().values()) if isinstance(row, Condition) and row not in DANGER)
 
 
 @lru_cache(256)
 def condition_of(cause: str) -> Condition | None:
     """The row of a cause by its text; ``None`` if it is of no condition."""
     found, most = None, -1
-    for row in (*DANGER, *SURVEY):
+    for row in TABLE.values():
         fixed = re.split(r"{.*?}", row.message)
         # After a message there may be a duration or a number of repetitions.
         pattern = ".*".join(map(re.escape, fixed)) + r"(,? (for|again after|on repetition) .*|; .*)?"

@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from ccatp.conditions import PRECEDENCE, MonitorFinding
+from ccatp.conditions import MonitorFinding
 from ccatp.config.models import HealthConfig
 from ccatp.core import EventCode, Severity, Verdict
 
@@ -61,8 +61,8 @@ _DENYING = (Severity.PAUSE, Severity.HOLD, Severity.FAULT)
 
 
 def gravest(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
-    """The finding with the highest severity; of equal ones that of the first row in the table of conditions."""
-    return max(findings, key=lambda finding: (finding.severity, PRECEDENCE[finding.condition]), default=None)
+    """The finding with the highest severity; of equal ones that of the lowest precedence number."""
+    return max(findings, key=lambda finding: (finding.severity, -finding.condition.precedence), default=None)
 
 
 def denies(findings: Iterable[MonitorFinding]) -> bool:

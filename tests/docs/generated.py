@@ -14,7 +14,7 @@ import click
 import ccatp.onboard.devices.daq
 from ccatp.beacons.mission import RULES
 from ccatp.cli import cli
-from ccatp.conditions import DANGER, SAMPLE_RATES, SURVEY, Action, Condition, Group
+from ccatp.conditions import SAMPLE_RATES, TABLE, Action, Condition, Group
 from ccatp.config.robot_limits import LIMITS
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervisor import PROCESSES
@@ -59,10 +59,10 @@ def table(head: str, rows: Iterable[Iterable[object]]) -> str:
 
 def alarms() -> str:
     """Every condition: what happens, and what to do."""
-    what = "| message | reaction | permitted motion | ends | limit | meaning | what to do |"
+    what = "| message | found by | reaction | permitted motion | ends | limit | meaning | what to do |"
     parts = []
     for group in Group:
-        rows = [_alarm(row) for row in (*DANGER, *SURVEY) if row.group is group]
+        rows = [_alarm(row) for row in TABLE.values() if row.group is group]
         parts += [f"## {group}\n", *([f"{ABOUT[group]}\n"] if group in ABOUT else []), table(what, rows), ""]
     return "\n".join(parts)
 
@@ -77,6 +77,7 @@ def _alarm(row: Condition) -> tuple[str, ...]:
     retries = "" if row.retries is None else f"; at the {('first', 'second')[row.retries]} return: fault"
     return (
         shown(row.message),
+        row.owner.value,
         row.action.value,
         row.motion.value,
         row.clear.value,

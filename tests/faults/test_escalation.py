@@ -10,7 +10,7 @@ import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccatp.conditions import DANGER, MonitorFinding
+from ccatp.conditions import MonitorFinding
 from ccatp.config.load import load_config
 from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import Severity, Verdict
@@ -20,6 +20,7 @@ from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
 from ccatp.safety.escalation import SeverityEscalation, denies, gravest
 from ccatp.sim.robot import Robot
+from tests.support.rows import DANGER
 
 HEALTH = load_config().health
 DENYING = {Severity.PAUSE, Severity.HOLD, Severity.FAULT}

@@ -12,7 +12,7 @@ import pytest
 import structlog
 import zmq
 
-from ccatp.conditions import DANGER, SURVEY, condition_of
+from ccatp.conditions import TABLE, condition_of
 from ccatp.core import EventCode, Verdict
 from ccatp.daemon.main_loop import STANDS_REPEAT_S, STANDS_REPORT_S, StandstillReport
 from ccatp.links import bus as bus_module
@@ -112,7 +112,7 @@ def test_advice_is_that_of_the_row_whose_message_it_is(cause: str, advice: str) 
 
 
 def test_each_row_is_found_by_its_message() -> None:
-    for row in (*DANGER, *SURVEY):
+    for row in TABLE.values():
         found = condition_of(re.sub(r"{.*?}", "left", row.message))
         assert found is not None
         assert found.message == row.message

@@ -4,13 +4,14 @@ import re
 
 import pytest
 
-from ccatp.conditions import DANGER, SURVEY, Condition, condition_of
+from ccatp.conditions import TABLE, Condition, condition_of
+from tests.support.rows import DANGER
 
 # A reference to another row, which an operator who reads one alarm does not see.
 ELSEWHERE = re.compile(r"\b(as above|as for|the same (for|where|but)|see above)\b", re.IGNORECASE)
 
 
-@pytest.mark.parametrize("row", [*DANGER, *SURVEY], ids=lambda row: row.name)
+@pytest.mark.parametrize("row", TABLE.values(), ids=lambda row: row.name)
 def test_an_advice_refers_to_no_other_row(row: Condition) -> None:
     assert row.advice
     assert not ELSEWHERE.search(row.advice)

@@ -11,12 +11,13 @@ from typing import Any
 import pytest
 
 from ccatp import conditions as rows
-from ccatp.conditions import DANGER, SURVEY, Condition, Group, Motion
+from ccatp.conditions import ALONE, TABLE, Condition, Group, Motion, Owner, fault
 from ccatp.core import EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.safety.escalation import gravest
+from tests.support.rows import DANGER
 from tests.support.scenario import config_of, mirror_of
 
 FRAME_S, SAMPLE_S = 0.01, 0.001
@@ -325,15 +326,24 @@ def test_every_row_is_brought_about_here_or_in_the_named_tests() -> None:
     assert set(DANGER) == {*here, *alone, *elsewhere}
 
 
-def test_names_are_unique() -> None:
-    names = [row.name for row in (*DANGER, *SURVEY)]
-    assert len(names) == len(set(names))
+def test_a_name_is_registered_once() -> None:
+    with pytest.raises(ValueError, match="conditions: grip_lost is registered twice"):
+        fault("grip_lost", Owner.MISSION, ALONE, Group.SURVEY, "again", "", "")
+    assert TABLE["grip_lost"] is rows.GRIP_LOST
 
 
-def test_of_two_the_graver_wins_and_of_equal_ones_the_first_row() -> None:
+def test_only_conditions_that_are_reported_alone_have_equal_precedence() -> None:
+    """A tie between findings of one frame is declared in no other way than by ``ALONE``."""
+    numbers = [row.precedence for row in TABLE.values() if row.precedence != ALONE]
+    assert len(numbers) == len(set(numbers))
+    assert {row.owner is Owner.DANGER for row in TABLE.values() if row.precedence == ALONE} == {False}
+    assert all(row.precedence != ALONE for row in DANGER)
+
+
+def test_of_two_the_graver_wins_and_of_equal_ones_the_lowest_number() -> None:
     for first, second in combinations(DANGER, 2):
         found = first.found("a", 1.0, 0.0), second.found("b", 1.0, 0.0)
-        winner = found[0] if first.severity >= second.severity else found[1]
+        winner = min(found, key=lambda one: (-one.severity, one.condition.precedence))
         assert gravest(found) is gravest(found[::-1]) is winner, f"{first.name} and {second.name}"
 
 

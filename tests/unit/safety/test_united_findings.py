@@ -8,7 +8,7 @@ from math import nan
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import DANGER, Condition, MonitorFinding
+from ccatp.conditions import Condition, MonitorFinding
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
@@ -16,6 +16,7 @@ from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import FindingLatch, with_findings
+from tests.support.rows import DANGER
 from tests.support.scenario import world_of
 
 CODES = {
