@@ -6,14 +6,14 @@ a fault is found; that of an emergency stays unless a return or a fault is found
 at a time. ``docs/alarms.md`` is generated from these rows. A mission may register rows of its own from another file.
 """
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, StrEnum
-from functools import lru_cache, partial
+from functools import partial
+from math import isfinite
 from typing import NamedTuple, ParamSpec
 
-from ccatp.core import EventCode, Severity, Verdict
+from ccatp.core import Cause, EventCode, Severity, Verdict
 
 
 class Motion(Enum):
@@ -98,6 +98,7 @@ class Condition:
     and permits express it. ``limit``: key of the configuration with the time after which it has the severity
     ``escalates_to``. ``full_fans``: full fans meanwhile.
     ``retries``: how often it may repeat before it is a fault; ``None``: as configured.
+    ``unit``: of the value against its limit. ``trusts_wheels``: what the wheels show in the hold is right.
     """
 
     name: str
@@ -115,20 +116,28 @@ class Condition:
     escalates_to: Severity = Severity.NONE
     full_fans: bool = False
     retries: int | None = None
+    unit: str = ""
+    trusts_wheels: bool = False
 
     @property
     def alarm_severity(self) -> Severity:
         """Severity in the list of alarms; for an edge or an emergency it follows from the action."""
         return self.severity or _ALARM_SEVERITY[self.action]
 
-    def text(self, **varies: object) -> str:
-        """The message with its variable parts."""
-        return self.message.format(**varies)
+    def because(self, **values: object) -> Cause:
+        """The condition as a cause; ``values``: of the variable parts of the message."""
+        return Cause(self.name, {name: _plain(value) for name, value in values.items()})
 
-    def found(self, signal: str, value: float, limit: float, **varies: str) -> "MonitorFinding":
-        """The finding that the condition applies: ``value`` against ``limit``; ``varies``: parts of the message."""
-        cause = self.text(**varies) if varies else self.message
-        return MonitorFinding(self, self.severity, cause, signal, value, limit, self.full_fans)
+    def found(self, signal: str, value: float, limit: float, **values: str) -> "MonitorFinding":
+        """The finding that the condition applies: ``value`` against ``limit``; ``values``: parts of the message."""
+        return MonitorFinding(self, self.severity, self.because(**values), signal, value, limit, self.full_fans)
+
+
+def _plain(value: object) -> int | float | str:
+    """A value as it travels; a number that JSON has no form for, and any other object, as text."""
+    if isinstance(value, str | int):
+        return value
+    return float(value) if isinstance(value, float) and isfinite(value) else str(value)
 
 
 class MonitorFinding(NamedTuple):
@@ -136,7 +145,7 @@ class MonitorFinding(NamedTuple):
 
     condition: Condition
     severity: Severity
-    cause: str
+    cause: Cause
     signal: str
     value: float
     limit: float
@@ -226,7 +235,8 @@ SAMPLE_RATES = {
 _RATE = "{sensor} deliver {rate} samples/s, at least {least} are needed"
 _FIRMWARE = "Set the rate in the robot's firmware; the sensor and its cable work."
 SENSOR_MUCH_TOO_SLOW = hold("sensor_much_too_slow", Owner.DANGER, 10, Group.SENSORS, _RATE,
-    "Encoders or edge sensors deliver less than half of what is needed. The robot stands.", _FIRMWARE)
+    "Encoders or edge sensors deliver less than half of what is needed. The robot stands.", _FIRMWARE,
+    trusts_wheels=True)
 SENSOR_TOO_SLOW = slow("sensor_too_slow", Owner.DANGER, 20, Group.SENSORS, _RATE,
     "The sample rate is lower than needed at full speed. The robot continues at half its speed.", _FIRMWARE)
 
@@ -244,7 +254,7 @@ WHEEL_SPEED_WRONG = hold("wheel_speed_wrong", Owner.DANGER, 50, Group.WHEELS,
     "Check gain and supply of the servo, the encoder's counts per turn, and the wheel radius in the firmware.")
 WHEELS_STAND = hold("wheels_stand", Owner.DANGER, 60, Group.WHEELS, "both wheels stand, or no encoder counts",
     "They were commanded to turn. The motor supply or both encoders fail.",
-    "Check the robot's supply and its own log.", retries=1)
+    "Check the robot's supply and its own log.", retries=1, unit="m/s")
 ENCODER_COUNTS_NOTHING = hold("encoder_counts_nothing", Owner.DANGER, 70, Group.WHEELS,
     "the {side} encoder counts nothing",
     "By the gyroscope the wheel turns, by its encoder it does not.", "Check the encoder's cable and disc.", retries=1)
@@ -276,7 +286,7 @@ GRIP_LITTLE = slow("grip_little", Owner.DANGER, 140, Group.WHEELS,
 YAW_DISAGREES = hold("yaw_disagrees", Owner.DANGER, 150, Group.SENSORS,
     "gyroscope and wheels disagree about the turn: a wheel slips, or the gyroscope is off",
     "They disagree by more than slip and scale errors explain. The robot takes a fix.",
-    "Wheels or mirror oily? Otherwise check the gyroscope.")
+    "Wheels or mirror oily? Otherwise check the gyroscope.", unit="rad/s")
 
 # -- fans -------------------------------------------------------------------------------------------------------------
 
@@ -296,19 +306,19 @@ FAN_REPORTED_ON_THE_FLAT = inform("fan_reported_on_the_flat", Owner.DANGER, 190,
 # -- link and clock ---------------------------------------------------------------------------------------------------
 
 DRIVES_TOO_LATE = pause("drives_too_late", Owner.DANGER, 200, Group.LINK, "drives reach the wheels too late",
-    "Commands take so long that the robot cannot be steered: a pause.", "Check the network.")
+    "Commands take so long that the robot cannot be steered: a pause.", "Check the network.", unit="s")
 DRIVES_LATE = slow("drives_late", Owner.DANGER, 210, Group.LINK, "drives reach the wheels late",
-    "Commands take long. Half the speed.", "Check the network.")
+    "Commands take long. Half the speed.", "Check the network.", unit="s")
 CLOCK_JUMPED = pause("clock_jumped", Owner.DANGER, 220, Group.LINK, "the robot's clock has jumped",
     "Its times are off by more than `health.clock_jump_s`. The clock's offset is measured again.",
-    "Nothing, unless it repeats.")
+    "Nothing, unless it repeats.", unit="s")
 SAMPLES_MISDATED = inform("samples_misdated", Owner.DANGER, 230, Group.LINK,
     "samples of the {sensor} are {side} their frame: not used",
     "A sample is later than its frame by more than 1 ms, or older by more than 1 s, so its time is not known. What is "
     "not used is missing: see the alarms about samples that are stale.",
     "Check how the firmware stamps its samples. After a stall of the robot's computer nothing, unless it repeats.")
 FRAMES_LOST = hold("frames_lost", Owner.DANGER, 240, Group.DATA, "frames were lost while the robot may have moved",
-    "A gap in the frames while the robot moved. The robot takes a fix.", "If it repeats, check the network.")
+    "A gap in the frames while the robot moved. The robot takes a fix.", "If it repeats, check the network.", unit="s")
 LINES_GARBLED = hold("lines_garbled", Owner.DANGER, 250, Group.DATA, "lines of the robot were no frames",
     "Several lines in a short time could not be read.",
     "Check network and firmware. `ccatp conformance` reports what is wrong in the robot's messages.")
@@ -316,10 +326,10 @@ LINES_GARBLED = hold("lines_garbled", Owner.DANGER, 250, Group.DATA, "lines of t
 # -- edge sensors and inertial unit -----------------------------------------------------------------------------------
 
 EDGE_SENSOR_CHATTERS = hold("edge_sensor_chatters", Owner.DANGER, 260, Group.SENSORS, "an edge sensor chatters",
-    "It changes many times a second where the map has no edge.", "Clean it; check its cable.")
+    "It changes many times a second where the map has no edge.", "Clean it; check its cable.", trusts_wheels=True)
 EDGE_SENSOR_FLASHES = pause("edge_sensor_flashes", Owner.DANGER, 270, Group.SENSORS,
     "an edge sensor went off though nothing moved",
-    "Light fell on it, or it fails.", "Nothing, unless it repeats. Stray light: cover the place.")
+    "Light fell on it, or it fails.", "Nothing, unless it repeats. Stray light: cover the place.", trusts_wheels=True)
 EDGE_SENSOR_STAYS_DARK = slow("edge_sensor_stays_dark", Owner.DANGER, 280, Group.SENSORS,
     "an edge sensor went off though nothing moved",
     "It stays off for longer than a pause may last: the edge rule decides, at half the speed.",
@@ -346,7 +356,7 @@ BATTERY_REPORTED = go_home("battery_reported", Owner.DANGER, 330, Group.FANS, "t
 # -- seams ------------------------------------------------------------------------------------------------------------
 
 EDGE_SENSOR_BLIND = hold("edge_sensor_blind", Owner.DANGER, 340, Group.SENSORS, "an edge sensor sees no seams: blind",
-    "It would not detect the rim either.", "Clean or replace it before `ccatp resume`.", retries=0)
+    "It would not detect the rim either.", "Clean or replace it before `ccatp resume`.", retries=0, trusts_wheels=True)
 SEAM_MISSED = slow("seam_missed", Owner.DANGER, 350, Group.SENSORS, "an edge sensor did not see a seam",
     "It crossed a seam without a signal. The robot continues at half its speed.",
     "Clean it; the second missed seam holds the robot.")
@@ -370,21 +380,22 @@ UNKNOWN_REPORTED = inform("unknown_reported", Owner.DANGER, 400, Group.WHEELS,
 
 NO_FRAME = pause("no_frame", Owner.DANGER, 410, Group.DATA, "no sensors frame",
     "The danger loop receives no frames from the robot.",
-    "Is the robot on, the network up? See the link's alarms below.")
+    "Is the robot on, the network up? See the link's alarms below.", unit="s")
 NO_EDGE_SAMPLES = pause("no_edge_samples", Owner.DANGER, 420, Group.DATA, "no edge samples",
-    "Frames arrive without edge samples.", "Check the robot's sensor board and its own log.")
+    "Frames arrive without edge samples.", "Check the robot's sensor board and its own log.", unit="s")
 EDGE_STALE = pause("edge_stale", Owner.DANGER, 430, Group.DATA, "edge samples stale",
-    "Frames arrive with old edge samples.", "Check the robot's sensor board and its own log.")
+    "Frames arrive with old edge samples.", "Check the robot's sensor board and its own log.", unit="s")
 ENCODERS_STALE = hold("encoders_stale", Owner.DANGER, 440, Group.DATA, "encoder samples stale",
     "No encoder samples arrive. Held until a fix, because the robot's motion is not known.",
-    "Check the robot's encoders; if it repeats, remove the robot.")
+    "Check the robot's encoders; if it repeats, remove the robot.", unit="s", trusts_wheels=True)
 NO_ESTIMATE = pause("no_estimate", Owner.DANGER, 450, Group.DATA, "no estimate",
-    "Main has not reported where the robot is: at the start, or while main is restarted.", "Nothing, unless it lasts.")
+    "Main has not reported where the robot is: at the start, or while main is restarted.", "Nothing, unless it lasts.",
+    unit="s")
 ESTIMATE_STALE = pause("estimate_stale", Owner.DANGER, 460, Group.DATA, "estimate stale",
     "Main is too slow or hangs.",
-    "Is something else busy on this machine? The supervisor restarts a main that hangs after two seconds.")
+    "Is something else busy on this machine? The supervisor restarts a main that hangs after two seconds.", unit="s")
 ESTIMATE_NOT_FINITE = pause("estimate_not_finite", Owner.DANGER, 470, Group.DATA, "estimate not finite",
-    "Main's estimate is not a number.", "Keep the run directory: this is a defect of ccatp.")
+    "Main's estimate is not a number.", "Keep the run directory: this is a defect of ccatp.", unit="s")
 
 # -- edges and emergencies --------------------------------------------------------------------------------------------
 
@@ -399,7 +410,7 @@ ALL_OFF = edge("all_off", Owner.DANGER, 490, Group.EDGES, "lifted or fallen",
 EDGE_SENSOR_STAYS_OFF = hold("edge_sensor_stays_off", Owner.DANGER, 500, Group.SENSORS,
     "an edge sensor stays off though it was moved back and the others are on",
     "The sensor fails, unless a fix, taken at once, shows a seam or the rim there: then the robot continues by itself.",
-    "Clean or replace it. `ccatp resume` continues if it is on again.", action=Action.LOCATE)
+    "Clean or replace it. `ccatp resume` continues if it is on again.", action=Action.LOCATE, trusts_wheels=True)
 RIM_AHEAD = edge("rim_ahead", Owner.DANGER, 510, Group.EDGES, "rim ahead on the map",
     "A sensor hangs over where the map has the rim.",
     "Nothing. If it repeats there: is the robot's pose plausible, is the base where the configuration has it?")
@@ -417,7 +428,7 @@ CENTRE_NEAR_RIM = edge("centre_near_rim", Owner.DANGER, 550, Group.EDGES,
     "the robot's centre is close to the rim on the map",
     "By its pose the robot is about to drive over the rim; no sensor has gone off yet.",
     "Is the pose plausible? If the robot is elsewhere: `ccatp stop`, carry it to base, remove `checkpoint`, "
-    "`--resume`.")
+    "`--resume`.", unit="m")
 EARTHQUAKE = shaken("earthquake", Owner.DANGER, 560, Group.OBSERVATORY, "emergency: earthquake",
     "Held, fans at their maximum, until it is cleared; then home.",
     "Clear it when its cause is gone and the robot is at base or held.")
@@ -428,14 +439,15 @@ EMERGENCY = go_home("emergency", Owner.DANGER, 570, Group.OBSERVATORY, "emergenc
 # -- among beacons ----------------------------------------------------------------------------------------------------
 
 RADIO_SILENT = beacon_hold("radio_silent", Owner.DANGER, 580, Group.BEACONS, "no beacon is received",
-    "No reading of a beacon for `danger.radio_timeout_s`.", "Check the robot's radio and the beacons' supply.")
+    "No reading of a beacon for `danger.radio_timeout_s`.", "Check the robot's radio and the beacons' supply.",
+    unit="s")
 NO_FRESH_ESTIMATE = beacon_hold("no_fresh_estimate", Owner.DANGER, 590, Group.BEACONS, "no fresh estimate",
     "Main has not reported where the robot is for `danger.estimate_timeout_s`.",
-    "Is something else busy on this machine?")
+    "Is something else busy on this machine?", unit="s")
 POSITION_UNCERTAIN = beacon_hold("position_uncertain", Owner.DANGER, 600, Group.BEACONS,
     "the position is too uncertain",
     "Its standard deviation is above `danger.position_sigma_m`. It ends below `danger.position_clear_m`.",
-    "Nothing, unless it lasts: beacons may fail.")
+    "Nothing, unless it lasts: beacons may fail.", unit="m")
 OBSTACLE_AHEAD = near("obstacle_ahead", Owner.DANGER, 610, Group.BEACONS, "an obstacle ahead",
     "An echo is nearer than `danger.obstacle_m` on the course. Code 1.", "Nothing: the robot drives around it.")
 TARGET_NEAR = near("target_near", Owner.DANGER, 620, Group.BEACONS, "the target is too near",
@@ -554,6 +566,9 @@ DISK_STALLS = fault("disk_stalls", Owner.FIXES, ALONE, Group.STORAGE,
     "the disk stalls: {point} is not stored after {time_s:g} s",
     "The disk does not answer.", "Check the disk; then `ccatp resume`.")
 
+RESTARTED = fault("restarted", Owner.OPERATOR, ALONE, Group.OBSERVATORY,
+    "{before}restarted: {done} points are measured and will be skipped, {left} are to do; 'ccatp resume' {goes_on}",
+    "A run was started again and waits for an operator.", "`ccatp resume` continues it.")
 OPERATOR = go_home("operator", Owner.OPERATOR, ALONE, Group.OBSERVATORY, "operator",
     "An operator called the robot home, or paused it: then it is held.",
     "`ccatp resume` after a pause; otherwise nothing, a new survey measures the remaining points.",
@@ -561,15 +576,29 @@ OPERATOR = go_home("operator", Owner.OPERATOR, ALONE, Group.OBSERVATORY, "operat
 # fmt: on
 
 
-@lru_cache(256)
-def condition_of(cause: str) -> Condition | None:
-    """The row of a cause by its text; ``None`` if it is of no condition."""
-    found, most = None, -1
-    for row in TABLE.values():
-        fixed = re.split(r"{.*?}", row.message)
-        # After a message there may be a duration or a number of repetitions.
-        pattern = ".*".join(map(re.escape, fixed)) + r"(,? (for|again after|on repetition) .*|; .*)?"
-        # Of two rows that match, the longer message counts.
-        if (length := sum(map(len, fixed))) > most and re.fullmatch(pattern, cause):
-            found, most = row, length
-    return found
+def text_of(cause: Cause) -> str:
+    """The text of a cause for people; a cause without a row here, of a newer version, is shown by its name."""
+    if not cause:
+        return ""
+    row = TABLE.get(cause.condition)
+    try:
+        text = cause.condition if row is None else row.message.format(**cause.values)
+    except (KeyError, ValueError, IndexError):  # the values are of another version
+        row, text = None, cause.condition
+    if row is None and cause.values:
+        text += f" ({', '.join(f'{name} {value}' for name, value in cause.values.items())})"
+    text += f", for {cause.lasted_s:g} s" if cause.lasted_s else ""
+    text += f", on repetition {cause.repetition}" if cause.repetition else ""
+    return text if cause.besides is None else f"{text}; {text_of(cause.besides)}"
+
+
+def danger_text(condition: str, cause: str, signal: str, value: float, limit: float) -> str:
+    """Like ``estimate stale: 0.31 s (limit 0.15 s)``; without a limit of 0 or a signal that ``cause`` names."""
+    named, row = signal.replace("_", " "), TABLE.get(condition)
+    is_named = not named or named in cause or (row is not None and row.group is Group.OBSERVATORY)
+    where = "" if is_named else f" ({named})"
+    if not limit:
+        return cause + where
+    shown, bound = (f"{number:.4g} {row.unit if row else ''}".rstrip() for number in (value, limit))
+    # A signal that was never received has its age set to the limit.
+    return f"{cause}{where}: " + (f"limit {bound}" if shown == bound else f"{shown} (limit {bound})")

@@ -158,13 +158,34 @@ class Corner(StrEnum):
     REAR_RIGHT = "rear_right"
 
 
+class Cause(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Why something happens: a condition by its name, with its numbers; false without a name.
+
+    ``ccatp.conditions.text_of`` makes the text for people, and nothing is decided by that text. ``values``: of the
+    variable parts of the message. ``lasted_s``, ``repetition``: why the severity was raised. ``besides``: what is found
+    besides it.
+    """
+
+    condition: str = ""
+    values: dict[str, int | float | str] = {}
+    lasted_s: float = 0.0
+    repetition: int = 0
+    besides: "Cause | None" = None
+
+    def __bool__(self) -> bool:
+        return bool(self.condition)
+
+
+NO_CAUSE = Cause()
+
+
 class Verdict(msgspec.Struct, frozen=True):
     """The danger loop's verdict on one sensors frame."""
 
     seq: int
     t_s: float
     code: EventCode
-    cause: str
+    cause: Cause
     signal: str  # source of ``cause`` ("front_left", "estimate", "emergency:fire"), or empty
     value: float  # of the signal, in the unit of ``limit``
     limit: float
@@ -264,27 +285,6 @@ def twist_of(right_rad_s: float, left_rad_s: float, wheel_radius_m: float, wheel
     return Twist(
         0.5 * wheel_radius_m * (right_rad_s + left_rad_s), wheel_radius_m * (right_rad_s - left_rad_s) / wheel_base_m
     )
-
-
-# Unit of the value, by the signal. A signal with values of several kinds has none; a stale or missing one has an age.
-_UNITS = dict.fromkeys(("estimate", "sensors", "enc", "frames", "clock", "latency", "radio"), "s") | {
-    "encoders": "m/s",
-    "imu_wz": "rad/s",
-    "position": "m",
-}
-
-
-def danger_text(cause: str, signal: str, value: float, limit: float) -> str:
-    """Like ``estimate stale: 0.31 s (limit 0.15 s)``; without a limit of 0 or a signal that ``cause`` names."""
-    named = signal.replace("_", " ")
-    where = "" if not named or named in cause or signal.startswith("emergency") else f" ({named})"
-    if not limit:
-        return cause + where
-    is_age = cause.startswith("no ") or "stale" in cause
-    unit = "s" if is_age else _UNITS.get(signal, "")
-    shown, bound = (f"{number:.4g} {unit}".rstrip() for number in (value, limit))
-    # A signal that was never received has its age set to the limit.
-    return f"{cause}{where}: " + (f"limit {bound}" if shown == bound else f"{shown} (limit {bound})")
 
 
 _Sample = TypeVar("_Sample", ImuSample, WheelSample, EdgeSample, GravitySample)

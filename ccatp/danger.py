@@ -24,7 +24,7 @@ import msgspec
 from ccatp import conditions
 from ccatp.conditions import MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.core import Corner, EdgeSample, EventCode, SteadyTime, Verdict, WheelSample
+from ccatp.core import NO_CAUSE, Corner, EdgeSample, EventCode, SteadyTime, Verdict, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
@@ -124,7 +124,7 @@ class DangerMonitor(EmergencyRules):
             found = self._look(board, sensors, t_s, wheels, samples)
         self.found = ()
         if not found and not missing and edges.is_idle and not origin.direction and not self.latch.is_latched:
-            self.verdict = verdict = Verdict(seq, sensors.t, _NORMAL, "", "", 0.0, 0.0, True, True, True)
+            self.verdict = verdict = Verdict(seq, sensors.t, _NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
             if board is not None and self._escalation.is_counting:
                 self._escalation.escalate(t_s, [])
         else:
@@ -249,7 +249,7 @@ class DangerMonitor(EmergencyRules):
     def _arbitrate(self, seq: int, t_s: float, findings: Sequence[MonitorFinding]) -> Verdict:
         missing = gravest(findings)
         if self._edges.is_lifted:
-            shown = conditions.ALL_OFF.message, "edge", 4.0, 3.0
+            shown = conditions.ALL_OFF.because(), "edge", 4.0, 3.0
             return Verdict(seq, t_s, EventCode.NEAR_EDGE, *shown, False, False, False, EVERYWHERE)
         declared = self._declared()
         if declared is not None or self._origin.direction:
@@ -257,7 +257,7 @@ class DangerMonitor(EmergencyRules):
         if missing is not None:
             return self._denied(seq, t_s, missing)
         emergency = self.latch.verdict(seq, t_s)
-        return emergency or Verdict(seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+        return emergency or Verdict(seq, t_s, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
 
     def _edge_verdict(
         self, seq: int, t_s: float, declared: EdgeDetector | None, missing: MonitorFinding | None
@@ -266,14 +266,14 @@ class DangerMonitor(EmergencyRules):
         if declared is not None:
             a, b, c, d = (e is not None and e.phase is EdgePhase.DECLARED for e in self._edges.episodes)
             off, turn = (a, b, c, d), not barred and all(e is None or e.permits_turn for e in self._edges.episodes)
-            cause, signal = declared.cause.message, CORNERS[off.index(True)].value
+            cause, signal = declared.cause.because(), CORNERS[off.index(True)].value
             value, limit = declared.value_m, declared.limit_m
         else:
             off, turn = (barred > 0, barred > 0, barred < 0, barred < 0), False
-            cause, signal = conditions.CENTRE_NEAR_RIM.message, "estimate"
+            cause, signal = conditions.CENTRE_NEAR_RIM.because(), "estimate"
             value, limit = origin.clearance_m, origin.limit_m
         forward, reverse = barred <= 0 and not (off[0] or off[1]), barred >= 0 and not (off[2] or off[3])
         permits = (forward, reverse, turn)
         if missing is not None:
-            cause, permits = f"{cause}; {missing.cause}", (False, False, False)
+            cause, permits = msgspec.structs.replace(cause, besides=missing.cause), (False, False, False)
         return Verdict(seq, t_s, EventCode.NEAR_EDGE, cause, signal, value, limit, *permits, off)

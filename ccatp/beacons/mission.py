@@ -25,7 +25,16 @@ from ccatp.survey.events import (
     SurveyInput,
     SurveyOutcome,
 )
-from ccatp.survey.failsafe import ON_EARTHQUAKE, ON_EMERGENCY, ON_FAULT, ON_HOLD, ON_NO_VERDICT, is_denied, pause
+from ccatp.survey.failsafe import (
+    ON_EARTHQUAKE,
+    ON_EMERGENCY,
+    ON_FAULT,
+    ON_HOLD,
+    ON_NO_VERDICT,
+    ON_UNKNOWN,
+    is_denied,
+    pause,
+)
 from ccatp.survey.state import Hold, HoldRules, HoldState, Row
 
 # States of such a mission. In idle, held and done the danger loop expects the robot to stand.
@@ -36,7 +45,7 @@ class BeaconRules(HoldRules[HoldState]):
     """A mission among beacons proceeds as soon as any motion is permitted."""
 
     rows = (
-        *(ON_EARTHQUAKE, ON_FAULT, ON_HOLD, ON_NO_VERDICT),
+        *(ON_EARTHQUAKE, ON_FAULT, ON_UNKNOWN, ON_HOLD, ON_NO_VERDICT),
         Row("nothing is permitted", Action.PAUSE, lambda _, v: is_denied(v), pause),
         ON_EMERGENCY,
     )
@@ -137,7 +146,7 @@ class BeaconMission:
             return HALT
         limit_s = self._cfg.mission.time_limit_s
         if t_s - self._begun_s > limit_s and self.state.mode is not IDLE and not self.state.abort_cause:
-            self.state = RULES.fault(self.state, MISSION_TOO_LONG.text(limit_s=limit_s))
+            self.state = RULES.fault(self.state, MISSION_TOO_LONG.because(limit_s=limit_s))
             return HALT
         drive = self._wanted(measurements, interval_s)
         return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)

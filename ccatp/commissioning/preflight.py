@@ -9,7 +9,7 @@ from math import dist
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from ccatp.conditions import SAMPLE_RATES, SENSOR_TOO_SLOW
+from ccatp.conditions import SAMPLE_RATES, SENSOR_TOO_SLOW, text_of
 from ccatp.config.models import Config
 from ccatp.control.thrust import forecast_grip
 from ccatp.core import Fix
@@ -198,7 +198,7 @@ def _rate(kind: str, count: int, report: RobotReport) -> PreflightResult | None:
     if (count + 1) / span_s >= least_hz:
         return None
     varies = {"rate": f"{count / span_s:.0f}", "least": f"{least_hz:.0f}"}
-    return failed(SENSOR_TOO_SLOW.text(sensor=sensor, **varies), SENSOR_TOO_SLOW.advice)
+    return failed(text_of(SENSOR_TOO_SLOW.because(sensor=sensor, **varies)), SENSOR_TOO_SLOW.advice)
 
 
 def _encoders(report: RobotReport) -> PreflightResult:

@@ -9,7 +9,7 @@ from math import isfinite
 
 from ccatp.conditions import FANS_REFUSED
 from ccatp.config.models import LimitsConfig, RobotConfig
-from ccatp.core import EventCode, Twist, Verdict, wheel_rates
+from ccatp.core import Cause, EventCode, Twist, Verdict, wheel_rates
 
 HELD = Twist(0.0, 0.0)
 # Part of the limits: room for the feedback, and for the feed-forward of the wheel lag, which adds T a to the speed.
@@ -137,7 +137,7 @@ class FanGate:
         self._floor = floor
         self.refused = 0
 
-    def refusal(self, left: float, right: float) -> str | None:
+    def refusal(self, left: float, right: float) -> Cause | None:
         """Why these duties must not be sent, or None. After a refusal the robot keeps its last duties."""
         for name, duty in (("left", left), ("right", right)):
             if not isfinite(duty) or not 0.0 <= duty <= 1.0:
@@ -147,5 +147,5 @@ class FanGate:
             else:
                 continue
             self.refused += 1
-            return FANS_REFUSED.text(why=why)
+            return FANS_REFUSED.because(why=why)
         return None

@@ -16,9 +16,9 @@ from typing import Literal, NamedTuple, cast
 import msgspec
 import structlog
 
-from ccatp.conditions import OPERATOR, condition_of
+from ccatp.conditions import OPERATOR, TABLE, text_of
 from ccatp.config.files import read_text
-from ccatp.core import Severity
+from ccatp.core import Cause, Severity
 from ccatp.links.topics import Alarm, SeverityName
 
 FILE = "alarms.jsonl"
@@ -43,12 +43,10 @@ class ActiveCause(NamedTuple):
     severity: Severity
 
 
-def active_cause(cause: str) -> ActiveCause:
-    """A cause from its text alone, with the severity of its row; ``other`` if there is no row."""
-    row = condition_of(cause)
-    return (
-        ActiveCause("other", cause, Severity.FAULT) if row is None else ActiveCause(row.name, cause, row.alarm_severity)
-    )
+def active_cause(cause: Cause) -> ActiveCause:
+    """A cause with the severity of its row; that of a condition that is not known here is the highest."""
+    row = TABLE.get(cause.condition)
+    return ActiveCause(cause.condition, text_of(cause), Severity.FAULT if row is None else row.alarm_severity)
 
 
 EventName = Literal["raised", "ended", "acknowledged"]
@@ -151,7 +149,7 @@ class AlarmList:
     def _apply(self, event: AlarmEvent) -> None:
         name, known = event.name, self._alarms.get(event.name)
         if event.event == "raised":
-            row = condition_of(event.cause.partition("; ")[0])
+            row = TABLE.get(name)
             alarm = Alarm(
                 name=name,
                 severity=event.severity,

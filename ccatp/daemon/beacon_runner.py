@@ -10,7 +10,7 @@ from ccatp.beacons.mission import BeaconMission, check_beacon_robot, track_row, 
 from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader
 from ccatp.beacons.steering import HALT
 from ccatp.beacons.store import BeaconStore
-from ccatp.conditions import FRAMES_MISSED
+from ccatp.conditions import FRAMES_MISSED, text_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
 from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
@@ -73,7 +73,8 @@ class BeaconRunner(MissionRunner):
             seq=self._clock.seq,
             t_s=self._clock.t_s,
             state=str(state.mode),
-            cause=state.cause,
+            cause=text_of(state.cause),
+            condition=state.cause.condition,
             done=mission.done,
             total=mission.total,
             point=f"waypoint {at + 1}" if at >= 0 else "",
@@ -106,7 +107,7 @@ class BeaconRunner(MissionRunner):
     def on_tracking_gap(self) -> None:
         """A fault: the robot's place is not known, and the map depends on it."""
         self._reader.forget()
-        self.mission.handle(Fault(FRAMES_MISSED.message))
+        self.mission.handle(Fault(FRAMES_MISSED.because()))
 
     def publish_state(self) -> None:
         state, before, was_faulted = self.mission.state, self._state, self._was_faulted
@@ -117,7 +118,7 @@ class BeaconRunner(MissionRunner):
         self.since_s = self._clock.t_s
         self.telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode)
         if HELD in (mode, before) or mode is RETURNING:
-            text = f"{mode}: {state.cause}" if state.cause else f"{mode}"
+            text = f"{mode}: {text_of(state.cause)}" if state.cause else f"{mode}"
             self.telemetry.notify_operator("warning", text)
             self._store.record_event(self._clock.t_s, "warning", text)
         if mode is DONE:

@@ -4,8 +4,9 @@ from collections.abc import Collection, Sequence
 
 from msgspec.structs import replace
 
+from ccatp.conditions import RESTARTED
 from ccatp.config.models import Config
-from ccatp.core import PointId
+from ccatp.core import Cause, PointId
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
 from ccatp.daemon.danger_loop import active_ids
 from ccatp.daemon.process import ProcessArgs
@@ -54,15 +55,16 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
             latched = [f"'ccatp clear {one}'" for one in active_ids(args.run_dir / EMERGENCIES)]
             if latched:
                 before = f"the last run ended with an emergency that is not cleared: {', '.join(latched)}; "
-        parts.mission.handle(Pause(before + _why_held(points, measured, skipped)))
+        parts.mission.handle(Pause(_why_held(before, points, measured, skipped)))
     return parts, store
 
 
-def _why_held(points: Sequence[PointId], measured: Collection[PointId], skipped: Collection[PointId]) -> str:
+def _why_held(
+    before: str, points: Sequence[PointId], measured: Collection[PointId], skipped: Collection[PointId]
+) -> Cause:
     left = [point for point in points if point not in measured and point not in skipped]
     goes_on = f"continues with point {left[0].row}-{left[0].col}-{left[0].point}" if left else "ends it"
-    counts = f"{len(measured)} points are measured and will be skipped, {len(left)} are to do"
-    return f"restarted: {counts}; 'ccatp resume' {goes_on}"
+    return RESTARTED.because(before=before, done=len(measured), left=len(left), goes_on=goes_on)
 
 
 def _open_store(cfg: Config, args: ProcessArgs, mirror: str, points: Sequence[PointId]) -> MissionStore:

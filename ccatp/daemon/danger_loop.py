@@ -17,10 +17,11 @@ from typing import Any
 import structlog
 import zmq
 
+from ccatp.conditions import text_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.files import read_text, sync_folder
 from ccatp.config.models import Config
-from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
+from ccatp.core import NO_CAUSE, Cause, EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.alarms import ActiveCause, active_cause
 from ccatp.daemon.command_handlers import ObservatoryServer
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
@@ -152,12 +153,8 @@ class DangerLoop(RobotLoop):
             context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
         )
         self._has_estimate = False
-        self._published: tuple[EventCode, str, Severity, frozenset[str]] = (
-            EventCode.NORMAL,
-            "",
-            Severity.NONE,
-            frozenset(),
-        )
+        self._published: tuple[EventCode, Cause, Severity, frozenset[str], list[Cause]]
+        self._published = EventCode.NORMAL, NO_CAUSE, Severity.NONE, frozenset(), []
         self._seq, self._t_s = -1, 0.0
         self._bad_lines = 0
         self._permits = PermitRule()
@@ -259,16 +256,17 @@ class DangerLoop(RobotLoop):
         if not (verdict.cause or self._published[1]):  # still no cause, so there is no finding either
             return
         found, emergencies = self.monitor.found, self.monitor.latch.causes
-        names = frozenset((*(finding.condition.name for finding in found), *emergencies))
-        news = verdict.code, verdict.cause, verdict.severity, names
+        names = frozenset(finding.condition.name for finding in found)
+        news = verdict.code, verdict.cause, verdict.severity, names, emergencies
         if news == self._published:
             return
         is_verdict_new = news[:3] != self._published[:3]
         self._published = news
-        active = [ActiveCause(one.condition.name, one.cause, one.severity) for one in found]
-        others = dict.fromkeys((verdict.cause, *emergencies))
-        active += [active_cause(cause) for cause in others if cause and cause not in {one.cause for one in found}]
-        fields: dict[str, Any] = {name: getattr(verdict, name) for name in ("cause", "signal", "value", "limit")}
+        active = [ActiveCause(one.condition.name, text_of(one.cause), one.severity) for one in found]
+        others = [verdict.cause, *(cause for cause in emergencies if cause != verdict.cause)]
+        active += [active_cause(cause) for cause in others if cause and cause not in [one.cause for one in found]]
+        fields: dict[str, Any] = {name: getattr(verdict, name) for name in ("signal", "value", "limit")}
+        fields |= {"cause": text_of(verdict.cause), "condition": verdict.cause.condition}
         fields |= {"code": int(verdict.code), "severity": int(verdict.severity)}
         listed = [(name, cause, int(severity)) for name, cause, severity in active]
         event = DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, active=listed, **fields)

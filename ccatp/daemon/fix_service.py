@@ -14,9 +14,10 @@ from ccatp.conditions import (
     LASER_NOT_READY,
     METROLOGY_UNRELIABLE,
     SKIP_NOT_STORED,
+    text_of,
 )
 from ccatp.config.models import MissionConfig
-from ccatp.core import DeckPose, Fix, PointId, Vector3
+from ccatp.core import NO_CAUSE, Cause, DeckPose, Fix, PointId, Vector3
 from ccatp.estimation.fixes import FixRefused
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry
@@ -38,12 +39,12 @@ LASER_PERIOD_S, LASER_REPORT_S = 1.0, 60.0
 REPEATS = 2
 
 
-class FrameRefused(EtalonError):
-    """The laser system measures in another frame or unit, and cannot be used in this mission."""
+class LaserUnusable(EtalonError):
+    """The laser system measures in another frame or unit, or its fixes stay at one place while the robot moves."""
 
-
-class LaserStuck(EtalonError):
-    """The fixes stay at one place while the robot moves."""
+    def __init__(self, cause: Cause) -> None:
+        super().__init__(text_of(cause))
+        self.cause = cause
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +91,8 @@ class FixService:
         self._wakes = asyncio.Event()
         self.is_busy = False  # from ``begin`` to the end of the measurement
         self.arrival_error_m = 0.0  # distance of the last fix from its point
-        self.metrology_cause = ""  # why the last points are no measurements, or empty
-        self.wait_cause = ""  # what the measurement waits for, or empty
+        self.metrology_cause = NO_CAUSE  # why the last points are no measurements
+        self.wait_cause = NO_CAUSE  # what the measurement waits for
 
     def begin(self, request: FixRequest) -> None:
         """Take a measurement; one in progress is finished first, and its result is dropped."""
@@ -144,13 +145,13 @@ class FixService:
         clock, reported_s = asyncio.get_running_loop().time, -inf
         try:
             while self._is_wanted(request) and not await self._client.is_laser_ready():
-                self.wait_cause = LASER_NOT_READY.message
+                self.wait_cause = LASER_NOT_READY.because()
                 if clock() - reported_s >= LASER_REPORT_S:
                     reported_s = clock()
-                    self._notify("warning", f"measurement of {_name(request.point)} waits: {self.wait_cause}")
+                    self._notify("warning", f"measurement of {_name(request.point)} waits: {LASER_NOT_READY.message}")
                 await asyncio.sleep(LASER_PERIOD_S)
         finally:
-            self.wait_cause = ""
+            self.wait_cause = NO_CAUSE
 
     async def _measure(self, request: FixRequest) -> tuple[Fix, str]:
         """Measure a fix, and fuse it if it is still wanted; returns it, and why it is doubted or an empty text."""
@@ -166,7 +167,7 @@ class FixService:
             fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.state.is_lost
         )
         stuck = "" if self._follow is None else self._follow.doubt(fix)
-        doubt, jump_m = finding.doubt or finding.refusal or stuck, 0.0
+        doubt, jump_m = finding.doubt or text_of(finding.refusal) or stuck, 0.0
         is_set_aside = bool(doubt)
         if not is_set_aside:
             try:
@@ -183,9 +184,9 @@ class FixService:
         )
         self._telemetry.send("fix", message)
         if finding.refusal:
-            raise FrameRefused(finding.refusal)
+            raise LaserUnusable(finding.refusal)
         if stuck and self._follow is not None and self._follow.is_certain:
-            raise LaserStuck(LASER_NOT_FOLLOWING.text(count=self._follow.standstills))
+            raise LaserUnusable(LASER_NOT_FOLLOWING.because(count=self._follow.standstills))
         if doubt:
             self._notify("info", f"the fix at {_name(request.point)} is not used: {doubt}")
             return doubt
@@ -199,11 +200,11 @@ class FixService:
     async def _fail(self, request: FixRequest, why: str, error: Exception | None) -> None:
         if isinstance(error, BadSolution):
             refusal = self._fix_gate.refusal_of(error.lengths_m, request.expected_m)
-            error = FrameRefused(refusal) if refusal else error
-        if isinstance(error, FrameRefused | LaserStuck):
+            error = LaserUnusable(refusal) if refusal else error
+        if isinstance(error, LaserUnusable):
             self._notify("error", str(error))
             if self._is_wanted(request):
-                self._mission.handle(Fault(str(error)))
+                self._mission.handle(Fault(error.cause))
             return
         self._notify("warning", f"measurement of {_name(request.point)} failed: {why}")
         if self._is_wanted(request):
@@ -214,7 +215,7 @@ class FixService:
             try:
                 await self._await_commit(self._store.record_skipped(request.point, request.t_s), request.point)
             except StoreError as error:
-                self._mission.handle(Fault(SKIP_NOT_STORED.text(point=_name(request.point), why=error)))
+                self._mission.handle(Fault(SKIP_NOT_STORED.because(point=_name(request.point), why=error)))
                 return
         self._mission.handle(FixFailed(request.point, cause, self._heading_sigma_of()))
 
@@ -231,7 +232,7 @@ class FixService:
             except AlreadyMeasuredError as error:
                 self._notify("warning", str(error))  # the point is stored already
             except StoreError as error:
-                mission.handle(Fault(FIX_NOT_STORED.text(point=_name(request.point), why=error)))
+                mission.handle(Fault(FIX_NOT_STORED.because(point=_name(request.point), why=error)))
                 return
             self._note_metrology(fix)
         self._mission.handle(FixStored(request.point, self._heading_sigma_of()))
@@ -239,12 +240,12 @@ class FixService:
     def _note_metrology(self, fix: Fix) -> None:
         """Count the points in a row that are no measurements; enough of them are an alarm, and never hold the robot."""
         self._unreliable = self._unreliable + 1 if fix.metrology == UNRELIABLE else 0
-        self.metrology_cause = ""
+        self.metrology_cause = NO_CAUSE
         if self._unreliable >= self._alarm_points:
             who = " ".join(map(str, fix.suspects))
-            self.metrology_cause = METROLOGY_UNRELIABLE.text(count=self._unreliable, channels=who)
+            self.metrology_cause = METROLOGY_UNRELIABLE.because(count=self._unreliable, channels=who)
         if self._unreliable == self._alarm_points:
-            self._notify("warning", self.metrology_cause)
+            self._notify("warning", text_of(self.metrology_cause))
 
     async def _await_commit(self, commit: "Future[Any]", point: PointId) -> None:
         """Wait for a commit while the robot stands; after ``STALLED_DISK_S`` it is a fault. StoreError: it failed."""
@@ -255,7 +256,7 @@ class FixService:
                 self._notify("warning", f"the disk is slow: {_name(point)} waits for its commit")
                 await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
             if not waiting.done():
-                self._mission.handle(Fault(DISK_STALLS.text(point=_name(point), time_s=STALLED_DISK_S)))
+                self._mission.handle(Fault(DISK_STALLS.because(point=_name(point), time_s=STALLED_DISK_S)))
                 self._on_finished()
             await waiting
         finally:

@@ -10,7 +10,17 @@ from typing import Any
 import zmq
 from msgspec.structs import replace
 
-from ccatp.conditions import FRAME_LATE, FRAMES_OLD, LINK_LOST, NO_FRAME_FOR, NO_VERDICT, Condition, condition_of
+from ccatp.conditions import (
+    FRAME_LATE,
+    FRAMES_OLD,
+    LINK_LOST,
+    NO_FRAME_FOR,
+    OPERATOR,
+    TABLE,
+    Condition,
+    Owner,
+    text_of,
+)
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import MissionClock, Severity, Verdict
 from ccatp.daemon.alarms import ActiveCause, AlarmList, active_cause
@@ -34,6 +44,7 @@ from ccatp.links.rpc import Router
 from ccatp.links.topics import ESTIMATE_FRAMES, DangerEvent, MissionStatus
 from ccatp.safety.escalation import Since
 from ccatp.survey.events import HELD, WAITS_FOR, Abort, Fault, Interrupted, Pause, Resume, StopHere
+from ccatp.survey.state import HoldState
 
 # The supervisor ends this process after it has received the last messages; a longer wait is reported.
 SHUTDOWN_REPORT_S = 30.0
@@ -51,16 +62,14 @@ EFFECT_TIMEOUT_S = 5.0
 STANDS_REPORT_S, STANDS_REPEAT_S = 30.0, 60.0
 
 
-# Causes of a pause that only this loop finds, so that it measures their duration itself.
-OWN_PAUSES = FRAME_LATE, FRAMES_OLD, NO_VERDICT
 # For a mission among beacons, which cannot relocalize: its pause becomes a fault without a hold before.
 BEACON_PAUSE_LIMITS_S = inf, 30.0
 
 
 COMMANDS: dict[OperatorCommand, Pause | Resume | Abort | StopHere] = {
-    OperatorCommand.PAUSE: Pause("operator"),
+    OperatorCommand.PAUSE: Pause(OPERATOR.because()),
     OperatorCommand.RESUME: Resume(),
-    OperatorCommand.ABORT: Abort("operator"),
+    OperatorCommand.ABORT: Abort(OPERATOR.because()),
     OperatorCommand.STOP: StopHere(),
 }
 
@@ -119,7 +128,7 @@ class MainLoop(RobotLoop):
         self._standstill, self._frame_age = StandstillReport(), FrameAge()
         health = None if isinstance(cfg, RadioConfig) else cfg.health
         self._pause_limits_s = (health.pause_limit_s, health.hold_limit_s) if health else BEACON_PAUSE_LIMITS_S
-        self._own_pause, self._has_gap = Since(), False
+        self._paused, self._has_gap = Since(), False
         self.exit_status = ExitStatus.INTERRUPTED
         self.alarms = AlarmList(args.run_dir, self.log)
         # Separate from the verdicts, which are read with the frames, because findings are reported without frames, too.
@@ -174,9 +183,9 @@ class MainLoop(RobotLoop):
         # If the next frame arrives soon, its samples show the motion since the last one.
         self._was_at_rest = self._runner.is_at_rest
         self.heartbeat.phase, self._unanswered = "rejoining", None
-        cause = LINK_LOST.text(reason=reason)
+        cause = LINK_LOST.because(reason=reason)
         self._runner.mission.handle(Interrupted(cause))
-        self._telemetry.notify_operator("warning", f"{cause}; reconnecting")
+        self._telemetry.notify_operator("warning", f"{text_of(cause)}; reconnecting")
 
     def _fail(self, error: Exception) -> None:
         """End this process with wheels held; the supervisor restarts it."""
@@ -248,17 +257,23 @@ class MainLoop(RobotLoop):
         """After its first limit a pause needs a fix before the robot moves; after its second one it is a fault."""
         mission = self._runner.mission
         state = mission.state
-        waits = state.mode is HELD and not state.is_held_by_hand and condition_of(state.cause) in OWN_PAUSES
-        lasts_s = self._own_pause.lasts(now_s, waits and not self.is_lockstep)
+        row = self._own_pause_of(state)
+        waits = row is not None and row.escalates_to is not Severity.NONE and not state.is_held_by_hand
+        lasts_s = self._paused.lasts(now_s, waits and not self.is_lockstep)
         hold_s, fault_s = self._pause_limits_s
         self._has_gap = self._has_gap and lasts_s >= 0.0
         if lasts_s >= hold_s and not self._has_gap:
             self._has_gap = True
             self._runner.on_tracking_gap()
         if lasts_s >= fault_s:
-            cause = f"{state.cause}, for {fault_s:g} s"
+            cause = replace(state.cause, lasted_s=fault_s)
             mission.handle(Fault(cause))
-            self._telemetry.notify_operator("error", cause)
+            self._telemetry.notify_operator("error", text_of(cause))
+
+    def _own_pause_of(self, state: HoldState) -> Condition | None:
+        """The row of a hold whose cause only this loop finds, so that it measures its duration itself."""
+        row = TABLE.get(state.cause.condition) if state.mode is HELD else None
+        return row if row is not None and row.owner is Owner.MAIN else None
 
     def _why_it_stands(self) -> str:
         """The reason for a standstill, with advice."""
@@ -276,12 +291,14 @@ class MainLoop(RobotLoop):
             why = self._runner.status().cause or "is it ready, the line of sight free?"
             return f"waiting for a measurement of the laser system; {why}"
         # A mission that has not begun has no cause of its own while it waits for a finding of danger to end.
-        found = [alarm.cause for alarm in self.alarms.alarms if not alarm.ended]
-        cause = next(iter((*filter(None, (state.cause,)), *found)), "")
-        if not cause:
+        row, why, alarms = TABLE.get(state.cause.condition), text_of(state.cause), self.alarms.alarms
+        advice = row.advice if row is not None else ""
+        if not why and alarms and not alarms[0].ended:
+            why, advice = alarms[0].cause, alarms[0].advice
+        if not why:
             return f"{state.mode}, and nothing is wrong: {WAITS_FOR[state.mode]}"
-        row, otherwise = condition_of(cause), "'ccatp resume' continues" if state.is_paused else "continues by itself"
-        return f"{state.mode}: {cause}; {row.advice if row is not None else otherwise}"
+        otherwise = "'ccatp resume' continues" if state.is_paused else "continues by itself"
+        return f"{state.mode}: {why}; {advice or otherwise}"
 
     def is_frame_due(self) -> bool:
         return self._unanswered is None
@@ -296,15 +313,15 @@ class MainLoop(RobotLoop):
         if age_s <= self.robot_cfg.sensors_timeout_s:
             return
         if self._interrupt(NO_FRAME_FOR, age_s=age_s):
-            self._telemetry.notify_operator("warning", self._runner.mission.state.cause)
+            self._telemetry.notify_operator("warning", text_of(self._runner.mission.state.cause))
             self.send_drive(self.clock.seq, STILL)
 
     def _interrupt(self, row: Condition, **values: float) -> bool:
         """Hold the mission until frames are fresh; returns whether this changed its state or its cause."""
-        mission, cause = self._runner.mission, row.text(**values)
+        mission, cause = self._runner.mission, row.because(**values)
         before = mission.state
         mission.handle(Interrupted(cause))
-        if before.mode is HELD and condition_of(before.cause) in {NO_FRAME_FOR, *OWN_PAUSES} - {row}:
+        if self._own_pause_of(before) not in (None, row):
             mission.state = replace(before, cause=cause)
         return mission.state is not before
 
@@ -434,7 +451,7 @@ class MainLoop(RobotLoop):
             if self._interrupt(row, late_ms=late_ms, limit_ms=limit_ms):
                 self.log.warning("frame_late", seq=self.clock.seq, lateness_ms=late_ms, limit_ms=limit_ms)
                 if is_old:
-                    self._telemetry.notify_operator("warning", runner.mission.state.cause)
+                    self._telemetry.notify_operator("warning", text_of(runner.mission.state.cause))
         drive = runner.plan(frame, verdict, lag_s)
         now_s = time.monotonic()
         is_slow, is_still = now_s - begun_s > self.frame_period_s, drive == STILL

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ccatp.core import Verdict
+from ccatp.core import Cause, Verdict
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Telemetry
 from ccatp.links.robot_messages import Hello, Sensors
@@ -77,8 +77,8 @@ class MissionRunner(ABC):
         return False
 
     @property
-    def causes(self) -> list[str]:
-        """Texts of the causes why the mission is held, goes home, or waits."""
+    def causes(self) -> list[Cause]:
+        """The causes why the mission is held, goes home, or waits."""
         state = self.mission.state
         return [cause for cause in (state.cause, state.abort_cause) if cause]
 

@@ -7,11 +7,11 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ccatp.conditions import UNATTENDED_FAULT
+from ccatp.conditions import UNATTENDED_FAULT, text_of
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
 from ccatp.control.wheel_motion import SentDrives, as_standing
-from ccatp.core import Verdict
+from ccatp.core import NO_CAUSE, Cause, Verdict
 from ccatp.daemon.checkpoints import build_parts
 from ccatp.daemon.fix_service import FixRequest, FixService
 from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
@@ -61,7 +61,7 @@ class CheckpointWriter:
         self._localizer, self._mission = localizer, mission
         self._run_id = read_run_id(run_dir)
         self._written: SurveyState | None = None
-        self._in_force = ("", "")
+        self._in_force = (NO_CAUSE, NO_CAUSE)
         self._period = -1
         self.boot = -1
 
@@ -80,7 +80,7 @@ class CheckpointWriter:
         pose = record.pose
         if not isfinite(pose.x_m + pose.y_m + pose.heading_rad + record.sigma_m + record.heading_sigma_rad):
             return  # keep the last valid one
-        before, self._in_force = self._in_force, (state.abort_cause, state.cause if state.is_held_by_hand else "")
+        before, self._in_force = self._in_force, (state.abort_cause, state.cause if state.is_held_by_hand else NO_CAUSE)
         self._file.write(record, is_durable=self._in_force != before)
 
     def close(self) -> None:
@@ -276,7 +276,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         return self._fix_service.is_busy
 
     @property
-    def causes(self) -> list[str]:
+    def causes(self) -> list[Cause]:
         own = self._fix_service.wait_cause, self._fix_service.metrology_cause
         return [*super().causes, *(cause for cause in own if cause)]
 
@@ -290,14 +290,15 @@ class SurveyRunner(SurveyFrames, MissionRunner):
 
     def status(self) -> MissionStatus:
         state, survey = self.mission.state, self.mission.survey
-        point = state.measuring_point
+        point, cause = state.measuring_point, state.cause or self._fix_service.wait_cause
         if state.is_paused:
             point = state.next_point
         return MissionStatus(
             seq=self._clock.seq,
             t_s=self._clock.t_s,
             state=str(state.mode),
-            cause=state.cause or self._fix_service.wait_cause,
+            cause=text_of(cause),
+            condition=cause.condition,
             done=len(state.done),
             skipped=len(state.skipped),
             total=self.parts.total_points,
@@ -363,7 +364,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
             self._fans_seq += 1
             self._loop.link.send_fans(self._fans_seq, duty)
         else:
-            self.telemetry.notify_operator("error", refusal)
+            self.telemetry.notify_operator("error", text_of(refusal))
             self.mission.handle(Fault(refusal))
 
     def on_tracking_gap(self) -> None:
@@ -440,10 +441,10 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         if action is FaultAction.REMIND:
             held_s = timer.held_s(self._clock.t_s)
             self.telemetry.notify_operator(
-                "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.state.cause}"
+                "error", f"held for {held_s:.0f} s, waiting for an operator: {text_of(mission.state.cause)}"
             )
         elif action is FaultAction.RETURN:
-            mission.handle(Abort(UNATTENDED_FAULT.text(charge=sensors.soc)))
+            mission.handle(Abort(UNATTENDED_FAULT.because(charge=sensors.soc)))
 
     def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
         mission, seq = self.mission, self._clock.seq
@@ -486,11 +487,11 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         self.since_s = self._clock.t_s
         if not state.is_faulted:
             self._fault_timer.over()
-        telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode, cause=state.cause)
+        telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode, cause=text_of(state.cause))
         if mode in (MissionState.HELD, MissionState.BACKING_OFF) or before is MissionState.HELD:
-            telemetry.notify_operator("warning", state_text(mode, state.cause))
+            telemetry.notify_operator("warning", state_text(mode, text_of(state.cause)))
         if mode is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
-            telemetry.notify_operator("warning", f"returning to base: {state.cause}")
+            telemetry.notify_operator("warning", f"returning to base: {text_of(state.cause)}")
         if mode is MissionState.DONE:
             self._loop.finish(EXIT_STATUS[state.outcome])
         elif state.is_faulted and self._loop.is_lockstep:

@@ -14,10 +14,10 @@ import structlog
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from ccatp.conditions import condition_of
+from ccatp.conditions import TABLE, danger_text
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
-from ccatp.core import Severity, danger_text
+from ccatp.core import Severity
 from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
@@ -110,7 +110,7 @@ class RunView:
         """Show a verdict that is new; an event also reports that further findings began or ended."""
         verdict = message.code, message.cause, message.severity
         if verdict != self._verdict and (message.code or message.severity in SHOWN):
-            text = danger_text(message.cause, message.signal, message.value, message.limit)
+            text = danger_text(message.condition, message.cause, message.signal, message.value, message.limit)
             what = f"code {message.code}" if message.code else Severity(message.severity).name.lower()
             self.show_message("warning", f"danger: {what}, {text}, at {message.t_s:.2f} s")
         self._verdict = verdict
@@ -229,7 +229,7 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
     bound = f"minimum {clock(status.lower_bound_s)}"
     # The error is exactly zero before the first arrival.
     arrival = f"{status.error_mm:.2f} mm from the last point, as estimated" if status.error_mm else "none yet"
-    row = condition_of(status.cause)
+    row = TABLE.get(status.condition)
     severity = Severity(max(status.severity, row.severity if row is not None else 0))
     late = f"{status.missed_deadlines}, worst {status.worst_lateness_ms:.0f} ms"
     grip = f"friction {status.friction:.2f}, thrust {status.grip:.2f} times the least that holds the robot"

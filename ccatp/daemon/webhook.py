@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
 from http import HTTPStatus
+from typing import NamedTuple
 
 import msgspec
 import structlog
@@ -30,6 +31,13 @@ class AlarmPost(msgspec.Struct, frozen=True):
     state: str
     alarm: Alarm
     left_out: int = 0
+
+
+class PostFailure(NamedTuple):
+    """Why a post was not accepted; ``is_final``: a repetition cannot succeed."""
+
+    why: str
+    is_final: bool
 
 
 def changes(before: dict[str, Alarm], after: dict[str, Alarm]) -> list[tuple[str, Alarm]]:
@@ -108,9 +116,9 @@ class AlarmWebhook:
     def _deliver(self, post: AlarmPost) -> bool:
         """Post until it is accepted, finally refused, or too old; False: the run ended before."""
         begun_s, pause_s = time.monotonic(), FIRST_PAUSE_S
-        while why := self._post(post):
-            if why.startswith("refused") or time.monotonic() - begun_s + pause_s > self._cfg.webhook_give_up_s:
-                self._log.warning("alarm_not_posted", name=post.alarm.name, what=post.event, why=why)
+        while failure := self._post(post):
+            if failure.is_final or time.monotonic() - begun_s + pause_s > self._cfg.webhook_give_up_s:
+                self._log.warning("alarm_not_posted", name=post.alarm.name, what=post.event, why=failure.why)
                 break
             with self._changed:
                 if self._changed.wait_for(lambda: self._is_over, pause_s):
@@ -118,18 +126,18 @@ class AlarmWebhook:
             pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
         return True
 
-    def _post(self, post: AlarmPost) -> str:
-        """Send a post; returns why it was not accepted, or an empty text."""
+    def _post(self, post: AlarmPost) -> PostFailure | None:
+        """Send a post; returns why it was not accepted, or ``None``."""
         headers = {"content-type": "application/json", "user-agent": "ccatp"}
         url, body = self._cfg.webhook_url, msgspec.json.encode(post)
         try:
             request = urllib.request.Request(url, body, headers, method="POST")  # noqa: S310 - http(s) by the configuration
             with urllib.request.urlopen(request, timeout=self._cfg.webhook_timeout_s):  # noqa: S310
-                return ""
+                return None
         except urllib.error.HTTPError as error:
             with suppress(OSError):
                 error.close()
             is_final = error.code < HTTPStatus.INTERNAL_SERVER_ERROR and error.code not in _PASSING
-            return f"{'refused' if is_final else 'not taken'}: status {error.code}"
+            return PostFailure(f"{'refused' if is_final else 'not taken'}: status {error.code}", is_final)
         except (OSError, ValueError) as error:
-            return f"no answer: {error}"
+            return PostFailure(f"no answer: {error}", is_final=False)

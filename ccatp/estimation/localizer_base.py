@@ -12,13 +12,7 @@ import numpy as np
 from ccatp.conditions import FILTER_DIVERGED, FRAMES_BACKWARD, SENSOR_BACKWARD
 from ccatp.config.models import Config
 from ccatp.control.wheel_motion import ImuGate, WheelMeans, largest_rate_rad_s
-from ccatp.core import (
-    EdgeSample,
-    Fix,
-    GravitySample,
-    ImuSample,
-    WheelSample,
-)
+from ccatp.core import NO_CAUSE, Cause, EdgeSample, Fix, GravitySample, ImuSample, WheelSample
 from ccatp.estimation.fixes import DeckFoot, check_fix, deck_foot
 from ccatp.estimation.wheel_coast import CoastedMotion, WheelCoast, WheelInput
 from ccatp.filters import FILTERS
@@ -221,7 +215,7 @@ class LocalizerBase(ABC):
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, states: int, wrap: FilterWrap) -> None:
-        self.t_s, self.hold_cause, self.is_frozen = -inf, "", False
+        self.t_s, self.hold_cause, self.is_frozen = -inf, NO_CAUSE, False
         self.gap_s = 0.0
         self.coasted: CoastedMotion | None = None
         self._coast = WheelCoast(cfg.robot.wheel_lag_s)
@@ -245,7 +239,7 @@ class LocalizerBase(ABC):
 
     def clear_hold(self) -> None:
         """Clear the cause for a hold; a cause that persists is set again."""
-        self.hold_cause = ""
+        self.hold_cause = NO_CAUSE
 
     def step(
         self,
@@ -284,7 +278,7 @@ class LocalizerBase(ABC):
             imu = believed
         imu, (right, left) = intake.imu(t_s, imu), intake.wheels(t_s, encoders)
         if intake.backward_source:
-            self._request_hold(SENSOR_BACKWARD.text(sensor=intake.backward_source))
+            self._request_hold(SENSOR_BACKWARD.because(sensor=intake.backward_source))
             intake.backward_source = ""
         self.coasted = None
         try:
@@ -306,7 +300,7 @@ class LocalizerBase(ABC):
                 return True
             self.counts["suspect_frames"] += 1
         if self._stale_run >= BACKWARD_LIMIT:
-            self._request_hold(FRAMES_BACKWARD.message)
+            self._request_hold(FRAMES_BACKWARD.because())
         return False
 
     def _check_speeds(self, v_m_s: float, omega_rad_s: float) -> None:
@@ -321,9 +315,9 @@ class LocalizerBase(ABC):
     def _freeze(self, error: FilterDiverged) -> None:
         self.is_frozen = True
         self.counts["diverged"] += 1
-        self._request_hold(FILTER_DIVERGED.text(why=error))
+        self._request_hold(FILTER_DIVERGED.because(why=error))
 
-    def _request_hold(self, cause: str) -> None:
+    def _request_hold(self, cause: Cause) -> None:
         self.hold_cause = self.hold_cause or cause
 
     @abstractmethod

@@ -80,7 +80,8 @@ class MissionStatus(Message):
     """Mission state for operators."""
 
     state: str
-    cause: str = ""
+    cause: str = ""  # for people
+    condition: str = ""  # name of the cause, see docs/alarms.md; empty in older recordings
     done: int = 0
     skipped: int = 0
     total: int = 0
@@ -216,7 +217,8 @@ class SessionMessage(Message):
 class DangerEvent(Message):
     """The verdict's code, cause or severity changed; without a cause nothing is found any more.
 
-    ``active``: all findings of danger, that of the verdict included: name of the condition, cause, severity.
+    ``cause``: for people. ``condition``: its name, empty in older recordings. ``active``: all findings of danger, that
+    of the verdict included: name of the condition, cause, severity.
     """
 
     code: int
@@ -226,6 +228,7 @@ class DangerEvent(Message):
     limit: float
     off: tuple[bool, bool, bool, bool]
     severity: int = 0
+    condition: str = ""
     active: list[tuple[str, str, int]] = []
 
 

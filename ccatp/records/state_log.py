@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ccatp.core import danger_text
+from ccatp.conditions import danger_text
 
 # Fields of every line.
 _OWN = frozenset(("logger", "process", "event", "level", "timestamp", "wall", "seq", "t_s"))
@@ -104,11 +104,11 @@ def _text(fields: dict[str, Any]) -> str:
 
 
 def _verdict(fields: dict[str, Any]) -> str:
-    cause, signal = str(fields.get("cause", "")), str(fields.get("signal", ""))
+    cause, signal, name = (str(fields.get(key, "")) for key in ("cause", "signal", "condition"))
     if not cause:
         return "danger: all is well again"
     value, limit = (found if isinstance(found := fields.get(key), int | float) else 0.0 for key in ("value", "limit"))
-    return f"danger: {danger_text(cause, signal, value, limit)}, event code {fields.get('code')}"
+    return f"danger: {danger_text(name, cause, signal, value, limit)}, event code {fields.get('code')}"
 
 
 def _shown(key: str, value: object) -> str:

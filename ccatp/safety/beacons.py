@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from math import atan2, cos, hypot, inf, isfinite, log, pi, sin, sqrt
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from ccatp.conditions import (
     ENCODERS_STALE,
     NO_FRAME,
@@ -21,7 +23,7 @@ from ccatp.conditions import (
     MonitorFinding,
 )
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import EventCode, Severity, Verdict, wrap_pi
+from ccatp.core import NO_CAUSE, EventCode, Severity, Verdict, wrap_pi
 from ccatp.links.beacon_messages import BeaconFrame
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
@@ -210,7 +212,7 @@ class BeaconSafetyRules(EmergencyRules):
             self._held_since_s = sensors.t
         held_s = sensors.t - self._held_since_s
         if held_s > self._danger.hold_limit_s:
-            hold = hold._replace(severity=Severity.FAULT, cause=f"{hold.cause} for {held_s:.0f} s")
+            hold = hold._replace(severity=Severity.FAULT, cause=replace(hold.cause, lasted_s=float(round(held_s))))
         return hold.verdict(sensors.seq, sensors.t, code)
 
     @property
@@ -227,13 +229,13 @@ class BeaconSafetyRules(EmergencyRules):
         target_m = self._nearest_target_m()
         forward, reverse = ahead_m >= danger.obstacle_m and target_m >= danger.target_m, behind_m >= danger.obstacle_m
         if ahead_m < danger.obstacle_m:
-            found = OBSTACLE_AHEAD.message, "obstacle", ahead_m, danger.obstacle_m
+            found = OBSTACLE_AHEAD.because(), "obstacle", ahead_m, danger.obstacle_m
         elif target_m < danger.target_m:
-            found = TARGET_NEAR.message, "target", target_m, danger.target_m
+            found = TARGET_NEAR.because(), "target", target_m, danger.target_m
         elif behind_m < danger.obstacle_m:
-            found = OBSTACLE_BEHIND.message, "obstacle", behind_m, danger.obstacle_m
+            found = OBSTACLE_BEHIND.because(), "obstacle", behind_m, danger.obstacle_m
         else:
-            return emergency or Verdict(seq, t_s, _NORMAL, "", "", 0.0, 0.0, True, True, True)
+            return emergency or Verdict(seq, t_s, _NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
         return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True)
 
     def _nearest_target_m(self) -> float:

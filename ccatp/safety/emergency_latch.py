@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import msgspec
 
-from ccatp.conditions import EMERGENCY, MonitorFinding
-from ccatp.core import EmergencyKind, EventCode, Verdict
+from ccatp.conditions import EARTHQUAKE, EMERGENCY, MonitorFinding
+from ccatp.core import Cause, EmergencyKind, EventCode, Verdict
 from ccatp.links.channels import (
     BadRequest,
     EmergencyRequest,
@@ -33,6 +33,11 @@ class Emergency:
     kind: EmergencyKind
     id: str
     note: str
+
+
+def cause_of(kind: EmergencyKind) -> Cause:
+    """The condition of a kind of emergency; in an earthquake the robot must not move."""
+    return EARTHQUAKE.because() if kind is EmergencyKind.EARTHQUAKE else EMERGENCY.because(kind=kind.value)
 
 
 class EmergencyLatch:
@@ -65,9 +70,9 @@ class EmergencyLatch:
         return next(reversed(self._active.values())) if self._active else None
 
     @property
-    def causes(self) -> list[str]:
-        """The text of each active kind, as operators see it."""
-        return [EMERGENCY.text(kind=kind) for kind in dict.fromkeys(one.kind for one in self._active.values())]
+    def causes(self) -> list[Cause]:
+        """The cause of each active kind."""
+        return [cause_of(kind) for kind in dict.fromkeys(one.kind for one in self._active.values())]
 
     def verdict(self, seq: int, t_s: float) -> Verdict | None:
         """Verdict of the newest emergency, or ``None``. Motion is permitted, because the robot shall drive home."""
@@ -76,7 +81,7 @@ class EmergencyLatch:
             return None
         # A robot that moves in an earthquake slips. From the other emergencies it drives home.
         kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.is_shaking else (newest.kind, True)
-        cause, signal = EMERGENCY.text(kind=kind), f"emergency:{kind}"
+        cause, signal = cause_of(kind), f"emergency:{kind}"
         return Verdict(seq, t_s, EventCode.ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
 
     def with_emergencies(self, verdict: Verdict) -> Verdict:

@@ -129,7 +129,7 @@ class SeverityEscalation:
             return finding
         patience_s = cfg.lifted_limit_s if finding.condition.limit == "health.lifted_limit_s" else cfg.hold_limit_s
         if lasted_s >= patience_s:
-            return finding._replace(severity=Severity.FAULT, cause=f"{finding.cause}, for {patience_s:g} s")
+            return finding._replace(severity=Severity.FAULT, cause=replace(finding.cause, lasted_s=patience_s))
         return self._count(t_s, finding, is_new=lasted_s == 0.0)
 
     def _count(self, t_s: float, finding: MonitorFinding, *, is_new: bool) -> MonitorFinding:
@@ -141,4 +141,4 @@ class SeverityEscalation:
         retries = cfg.retries if finding.condition.retries is None else finding.condition.retries
         if len(held) <= retries + 1:
             return finding
-        return finding._replace(severity=Severity.FAULT, cause=f"{finding.cause}, on repetition {len(held) - 1}")
+        return finding._replace(severity=Severity.FAULT, cause=replace(finding.cause, repetition=len(held) - 1))

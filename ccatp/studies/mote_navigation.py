@@ -13,6 +13,7 @@ import numpy as np
 from ccatp.beacons.mission import BeaconMission, TrackRow, track_row, wheel_rates
 from ccatp.beacons.navigation import MeasurementReader
 from ccatp.beacons.steering import HALT, SteeringCommand
+from ccatp.conditions import text_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, Verdict
 from ccatp.filters.metrics import nees, rms
@@ -124,7 +125,7 @@ class BeaconSilWorld:
     def result(self) -> BeaconSilResult:
         """The result at the end."""
         found, mission, summary = self.found, self.mission, self._summary
-        found.outcome, found.cause = str(mission.state.outcome), mission.state.cause
+        found.outcome, found.cause = str(mission.state.outcome), text_of(mission.state.cause)
         score = mission.navigator.score
         summary.track, summary.truth = list(found.track), list(found.truth)
         summary.places, summary.beacons = self.robot.truth_preface()[1].places, mission.navigator.beacons

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ccatp.conditions import GRIP_LOST
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.thrust import ThrustControl, forecast_grip
@@ -321,7 +322,7 @@ def run_slides(job: Job) -> JobOutcome:
                 drive.step(twist)
             drive.set_friction(cfg.sim.physics.friction)
             frames = 0
-            while frames < _SLIDE_FRAMES and (drive.verdict is None or drive.verdict.signal != "grip"):
+            while frames < _SLIDE_FRAMES and (drive.verdict is None or drive.verdict.cause.condition != GRIP_LOST.name):
                 drive.step(twist)
                 frames += 1
             if frames < _SLIDE_FRAMES:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelPose, PointId, SteadyTime, Verdict, difference
 from ccatp.daemon.mission_runner import STILL, DriveCommand, TimedFrame
@@ -366,7 +367,7 @@ class SilRun(SurveyFrames):
             corrections=state.corrections,
             counts={**self.localizer.counts, **self.laser.counts},
             outcome=str(state.outcome if state.mode is DONE else SurveyOutcome.STOPPED),
-            cause=state.cause,
+            cause=text_of(state.cause),
             states_s={str(state): time_s for state, time_s in self.states_s.items()},
             track=track,
         )

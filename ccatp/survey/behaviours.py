@@ -245,7 +245,7 @@ class Retreat(msgspec.Struct, frozen=True, tag=True):
         if not is_clear:
             # The turn moved a corner sensor off the panels. At the rim, undo the turn; where it may be a seam, a fix
             # decides.
-            step = RetreatStep.UNTURN if verdict.cause.startswith(RIM_AHEAD.message) else RetreatStep.OVER
+            step = RetreatStep.UNTURN if verdict.cause.condition == RIM_AHEAD.name else RetreatStep.OVER
             unturn = -copysign(1.0, self.away_rad)
             return replace(self, step=step, has_turned_away=True, unturn=unturn, turned_rad=0.0), STILL
         turn, goal_rad = self.turn, self.goal_rad

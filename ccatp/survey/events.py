@@ -5,7 +5,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from ccatp.control.gate import Purpose
-from ccatp.core import PointId
+from ccatp.core import Cause, PointId
 
 
 class MissionState(StrEnum):
@@ -114,7 +114,7 @@ def next_state(state: MissionState, event: MissionEvent) -> MissionState:
 class Pause(NamedTuple):
     """Hold until an operator resumes."""
 
-    cause: str
+    cause: Cause
 
 
 class Resume(NamedTuple):
@@ -124,7 +124,7 @@ class Resume(NamedTuple):
 class Abort(NamedTuple):
     """Return to base and end there."""
 
-    cause: str
+    cause: Cause
 
 
 class StopHere(NamedTuple):
@@ -134,20 +134,20 @@ class StopHere(NamedTuple):
 class Interrupted(NamedTuple):
     """Frames or verdicts are not fresh: hold until they are."""
 
-    cause: str
+    cause: Cause
 
 
 class Fault(NamedTuple):
     """Something is wrong: hold until an operator resumes."""
 
-    cause: str
+    cause: Cause
     loses_pose: bool = False
 
 
 class EstimateDiverged(NamedTuple):
     """The localizer is frozen until it has a fix. Repeated divergence is a fault."""
 
-    cause: str
+    cause: Cause
     t_s: float
 
 

@@ -7,8 +7,18 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from ccatp.conditions import BACK_OFFS, EARTHQUAKE, Action
-from ccatp.core import Corner, Severity, Verdict
+from ccatp.conditions import (
+    BACK_OFFS,
+    EARTHQUAKE,
+    EDGE_SENSOR_BLIND,
+    EDGE_SENSOR_CHATTERS,
+    EDGE_SENSOR_FLASHES,
+    EDGE_SENSOR_STAYS_OFF,
+    TABLE,
+    Action,
+    Condition,
+)
+from ccatp.core import Severity, Verdict
 from ccatp.survey.behaviours import Retreat, ReturnHome
 from ccatp.survey.events import BACKING_OFF, DONE, DRIVING, HELD, TURNING, MissionEvent
 from ccatp.survey.route_follower import StateEstimate
@@ -30,15 +40,18 @@ if TYPE_CHECKING:
     from ccatp.survey.statechart import Survey
 
 REDUCED = Severity.SLOW, RETURN
-CORNERS = frozenset(Corner)
-# Signals of findings after which what the wheels show is still right: edge sensors, and missing encoder samples, for
-# which the localizer accounts by itself.
-KEEPS_ODOMETRY = frozenset((*CORNERS, "enc"))
+# Faults of one edge sensor: a fix at rest shows whether it may be over a seam or the rim.
+OF_ONE_SENSOR = EDGE_SENSOR_CHATTERS, EDGE_SENSOR_FLASHES, EDGE_SENSOR_STAYS_OFF, EDGE_SENSOR_BLIND
 
 
 def is_denied(v: Verdict) -> bool:
     """Whether no motion is permitted."""
     return not (v.forward or v.reverse or v.turn)
+
+
+def row_of(v: Verdict) -> Condition | None:
+    """The row of a verdict's cause; ``None`` without a cause, or for one that is not known here."""
+    return TABLE.get(v.cause.condition)
 
 
 # -- rows of every mission --------------------------------------------------------------------------------------------
@@ -48,8 +61,8 @@ def _stand_in_earthquake(rules: HoldRules[S], s: S, _frame: object, v: Verdict) 
     """No motion in an earthquake. Afterwards the robot relocalizes, because it may have slipped, and drives home."""
     s = replace(s, emergency_epoch=v.raised)
     if not s.interlock and s.mode is not DONE:
-        why = EARTHQUAKE.message
-        s = rules.lose_pose(replace(s, interlock=why, abort_cause=s.abort_cause or why))
+        why = EARTHQUAKE.because()
+        s = rules.lose_pose(replace(s, interlock=True, abort_cause=s.abort_cause or why))
         s = rules.hold(s, why, by_hand=s.is_held_by_hand)
     # A fault is left to its own row, because it also needs an operator.
     return s, v.severity is not FAULT
@@ -62,7 +75,8 @@ def _fault(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bo
 
 
 def _hold(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
-    return rules.await_recovery(s, v.cause, rejects_odometry=v.signal not in KEEPS_ODOMETRY), True
+    row = row_of(v)
+    return rules.await_recovery(s, v.cause, rejects_odometry=row is None or not row.trusts_wheels), True
 
 
 def pause(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
@@ -89,6 +103,12 @@ ON_HOLD = Row(
     "the severity is hold or above, and nothing is permitted",
     Action.HOLD,
     lambda _, v: v.severity >= HOLD and is_denied(v),
+    _hold,
+)
+ON_UNKNOWN = Row(
+    "the cause is not known here: the danger loop is of another version",
+    Action.HOLD,
+    lambda _, v: bool(v.cause) and row_of(v) is None,
     _hold,
 )
 ON_NO_VERDICT = Row("no verdict is fresh enough", Action.PAUSE, lambda _, v: v is NO_FRESH_VERDICT, pause)
@@ -150,7 +170,7 @@ def _retreat(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict
         return s, True
     mission, backoffs = survey.cfg.mission, s.backoffs + 1
     if backoffs > mission.max_backoffs_per_stop:
-        return survey.fault(replace(s, backoffs=0), BACK_OFFS.text(count=mission.max_backoffs_per_stop)), True
+        return survey.fault(replace(s, backoffs=0), BACK_OFFS.because(count=mission.max_backoffs_per_stop)), True
     s = replace(
         s,
         backoffs=backoffs,
@@ -168,10 +188,11 @@ def _retreat(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict
 ROWS = (
     ON_EARTHQUAKE,
     ON_FAULT,
+    ON_UNKNOWN,
     Row(
-        "one edge sensor stays off: hold for its signal, and nothing is permitted",
+        "the severity is hold for a fault of one edge sensor, and nothing is permitted",
         Action.LOCATE,
-        lambda _, v: v.severity is HOLD and v.signal in CORNERS and is_denied(v),
+        lambda _, v: v.severity is HOLD and row_of(v) in OF_ONE_SENSOR and is_denied(v),
         _locate,
     ),
     ON_HOLD,

@@ -14,7 +14,7 @@ import numpy as np
 
 from ccatp.conditions import FRAME_REFUSED, LENGTHS_REFUSED
 from ccatp.config.models import Config, EtalonConfig
-from ccatp.core import DeckPose, Fix, FloatArray, PointId, Vector3
+from ccatp.core import NO_CAUSE, Cause, DeckPose, Fix, FloatArray, PointId, Vector3
 from ccatp.estimation.fixes import DeckFoot, FixRefused, deck_foot
 from ccatp.localizer import FOUR_STATE
 from ccatp.mirror.mirror import Mirror
@@ -132,7 +132,7 @@ class FixFinding(NamedTuple):
     """
 
     doubt: str = ""
-    refusal: str = ""
+    refusal: Cause = NO_CAUSE
 
 
 class FixGate:
@@ -164,7 +164,9 @@ class FixGate:
         if why is not None and (is_first or why):
             where = "its base" if is_first else "the place it drove to"
             distance_m = dist(fix.position_m, expected_m)
-            return FixFinding(refusal=FRAME_REFUSED.text(distance_m=distance_m, place=where, why=why or _UNEXPLAINED))
+            return FixFinding(
+                refusal=FRAME_REFUSED.because(distance_m=distance_m, place=where, why=why or _UNEXPLAINED)
+            )
         return FixFinding(doubt=self._doubt(fix, pose, covariance))
 
     def _doubt(self, fix: Fix, pose: DeckPose, covariance: FloatArray) -> str:
@@ -192,12 +194,12 @@ class FixGate:
         expected_mm = distance_mm * sqrt(cfg.doubt_nis / nis)
         return f"it is {_digits(distance_mm)} mm from the estimate, expected at most {_digits(expected_mm)} mm"
 
-    def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> str:
+    def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> Cause:
         """Why the laser system is refused when lengths gave no position; empty after the first fix."""
         if not self._is_first:
-            return ""
+            return NO_CAUSE
         why = explain_lengths(self._cfg, expected_m, lengths_m, self._collimators_m)
-        return LENGTHS_REFUSED.text(why=why) if why else ""
+        return LENGTHS_REFUSED.because(why=why) if why else NO_CAUSE
 
 
 # Guard band (ISO 14253-1): the tolerance is reduced by the uncertainty of the fix. It is limited, so that an imprecise

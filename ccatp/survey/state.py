@@ -8,9 +8,9 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from ccatp.conditions import EARTHQUAKE, NO_VERDICT, Action
+from ccatp.conditions import EARTHQUAKE, NO_VERDICT, Action, text_of
 from ccatp.control.gate import Purpose
-from ccatp.core import EventCode, PointId, Severity, Stop, Verdict
+from ccatp.core import NO_CAUSE, Cause, EventCode, PointId, Severity, Stop, Verdict
 from ccatp.survey.behaviours import Retreat, ReturnHome, Settling
 from ccatp.survey.budget import BudgetProgress
 from ccatp.survey.events import (
@@ -60,17 +60,17 @@ class HoldState(msgspec.Struct, frozen=True):
 
     mode: MissionState = IDLE
     outcome: SurveyOutcome = SurveyOutcome.NONE
-    cause: str = ""
+    cause: Cause = NO_CAUSE
     hold: Hold = Hold()
-    abort_cause: str = ""  # why the mission was aborted
-    interlock: str = ""  # why no motion is allowed: an earthquake
+    abort_cause: Cause = NO_CAUSE  # why the mission was aborted
+    interlock: bool = False  # no motion is allowed: an earthquake
     is_latched: bool = False  # in the newest verdict: an emergency is latched
     is_shaking: bool = False  # likewise: an earthquake
     severity: Severity = Severity.NONE  # of the newest verdict
     is_slow: bool = False
     full_fans: bool = False  # full fans from now on
     has_looked: bool = False  # a fix was taken because a sensor stays off
-    finding: str = ""  # the cause of the last return home
+    finding: Cause = NO_CAUSE  # the cause of the last return home
     emergency_epoch: int | None = 0  # the newest emergency acted on; None: take it from the first verdict
     stuck_s: float | None = None  # when a retreat ended without leaving the edge
     resumes_after_s: float = -inf  # a hold that ends by itself lasts at least until then
@@ -93,7 +93,7 @@ class HoldState(msgspec.Struct, frozen=True):
     @property
     def is_paused(self) -> bool:
         """Held until an operator resumes, or reports that an earthquake is over."""
-        return self.mode is HELD and (self.hold.by_hand or bool(self.interlock))
+        return self.mode is HELD and (self.hold.by_hand or self.interlock)
 
     @property
     def stands_for_fix(self) -> bool:
@@ -238,19 +238,19 @@ class HoldRules(Generic[S]):
         mode = next_state(s.mode, event)
         return s if mode is s.mode else replace(s, mode=mode)
 
-    def hold(self, s: S, cause: str, *, by_hand: bool, is_fault: bool = False) -> S:
+    def hold(self, s: S, cause: Cause, *, by_hand: bool, is_fault: bool = False) -> S:
         """Hold until an operator resumes (``by_hand``) or the cause is gone."""
         return self.apply(replace(s, hold=Hold(by_hand, is_fault or s.hold.is_fault), cause=cause), MissionEvent.HOLD)
 
-    def interrupt(self, s: S, cause: str) -> S:
+    def interrupt(self, s: S, cause: Cause) -> S:
         """Hold until the cause is gone; no effect in a mode in which the robot stands anyway."""
         return s if s.mode in (IDLE, HELD, DONE) else self.hold(s, cause, by_hand=False)
 
-    def fault(self, s: S, cause: str, *, loses_pose: bool = False) -> S:
+    def fault(self, s: S, cause: Cause, *, loses_pose: bool = False) -> S:
         """Hold until an operator resumes, because of a fault. With ``loses_pose`` the robot relocalizes then."""
         return s if s.mode is DONE else self.hold(s, cause, by_hand=True, is_fault=True)
 
-    def await_recovery(self, s: S, cause: str, *, rejects_odometry: bool = False) -> S:
+    def await_recovery(self, s: S, cause: Cause, *, rejects_odometry: bool = False) -> S:
         """Hold until the cause is gone, then relocalize before moving on."""
         if s.mode is DONE or s.is_held_by_hand:
             return s
@@ -258,7 +258,7 @@ class HoldRules(Generic[S]):
         s = self.lose_pose(replace(self.interrupt(s, cause), cause=cause), doubts_odometry=False)
         return replace(s, hold=s.hold._replace(rejects_odometry=rejects_odometry))
 
-    def abort(self, s: S, cause: str) -> S:
+    def abort(self, s: S, cause: Cause) -> S:
         """Return to base and end there."""
         if s.mode is DONE:
             return s
@@ -316,17 +316,22 @@ def _resume_refusal(s: HoldState) -> str | None:
     if s.mode is not HELD:
         return f"the mission is not held but {s.mode}"
     if s.interlock or s.is_shaking:
-        return f"{s.interlock or EARTHQUAKE.message}: nothing moves until that is cleared"
+        return f"{EARTHQUAKE.message}: nothing moves until that is cleared"
     if s.is_latched and not s.abort_cause:
         return "an emergency of before is latched: 'ccatp clear' it first"
     if s.severity >= HOLD and s.severity is not RETURN:
-        return f"the cause persists: {s.cause}"
+        return f"the cause persists: {text_of(s.cause)}"
     return None
 
 
 def _is_routine(s: HoldState, v: Verdict) -> bool:
     """Whether no row applies, and nothing in the verdict has to be stored in the state."""
-    is_normal = v.severity is NONE and v.code is EventCode.NORMAL and not (v.is_shaking or v.raised or v.full_fans)
+    is_normal = (
+        not v.cause
+        and v.severity is NONE
+        and v.code is EventCode.NORMAL
+        and not (v.is_shaking or v.raised or v.full_fans)
+    )
     was_normal = s.severity is NONE and not (s.is_latched or s.is_shaking or s.interlock or s.has_looked or s.is_slow)
     is_known = s.emergency_epoch is not None and s.stuck_s is None
     return is_normal and was_normal and is_known and v.forward and v.reverse and v.turn
@@ -335,7 +340,7 @@ def _is_routine(s: HoldState, v: Verdict) -> bool:
 def _with_levels(s: S, v: Verdict) -> S:
     """Store the parts of a verdict that later frames need."""
     epoch, full_fans = s.emergency_epoch, s.full_fans or v.full_fans or v.is_shaking
-    has_looked, interlock = s.has_looked and v.severity >= HOLD, s.interlock if v.is_shaking else ""
+    has_looked, interlock = s.has_looked and v.severity >= HOLD, s.interlock and v.is_shaking
     levels = v.raised > 0, v.is_shaking, v.severity, full_fans, has_looked, interlock
     known = s.is_latched, s.is_shaking, s.severity, s.full_fans, s.has_looked, s.interlock
     if levels == known and epoch is not None:

@@ -6,9 +6,10 @@ from math import hypot
 from msgspec.structs import replace
 
 from ccatp import conditions
+from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase
-from ccatp.core import EventCode, PointId, Stop, StopKind, Verdict
+from ccatp.core import NO_CAUSE, Cause, EventCode, PointId, Stop, StopKind, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import (
     HOLD_POSITION,
@@ -93,7 +94,7 @@ class Survey(HoldRules[SurveyState]):
         """Points that were skipped, or will not be measured any more, with the reason."""
         out = dict(s.failure_causes)
         if s.mode is DONE:
-            why, over = s.cause or str(s.outcome), {*s.done, *out}
+            why, over = text_of(s.cause) or str(s.outcome), {*s.done, *out}
             out |= {point: why for point in self._points if point not in over}
         return out
 
@@ -134,11 +135,11 @@ class Survey(HoldRules[SurveyState]):
 
     # -- transitions --------------------------------------------------------------------------------------------------
 
-    def hold(self, s: SurveyState, cause: str, *, by_hand: bool, is_fault: bool = False) -> SurveyState:
+    def hold(self, s: SurveyState, cause: Cause, *, by_hand: bool, is_fault: bool = False) -> SurveyState:
         """Hold, and drop the current behaviour, which begins again afterwards."""
         return super().hold(replace(s, behaviour=None, is_missed=False), cause, by_hand=by_hand, is_fault=is_fault)
 
-    def fault(self, s: SurveyState, cause: str, *, loses_pose: bool = False) -> SurveyState:
+    def fault(self, s: SurveyState, cause: Cause, *, loses_pose: bool = False) -> SurveyState:
         """Hold until an operator resumes; with ``loses_pose`` the robot relocalizes then."""
         if loses_pose and s.fix is FixNeed.NONE and s.mode is not DONE:
             s = self.lose_pose(s)
@@ -173,7 +174,7 @@ class Survey(HoldRules[SurveyState]):
             s = self._begin_second_round(s)
             if not s.due:
                 return self.apply(replace(s, outcome=SurveyOutcome.COMPLETE), MissionEvent.FINISHED)
-        return self.apply(replace(s, cause=""), MissionEvent.GO_ON)
+        return self.apply(replace(s, cause=NO_CAUSE), MissionEvent.GO_ON)
 
     def _begin_second_round(self, s: SurveyState) -> SurveyState:
         """Failed points that were not tried again yet are due; the last first, because the robot is nearest to it."""
@@ -227,7 +228,7 @@ class Survey(HoldRules[SurveyState]):
         """Stand for a fix, which needs no motion."""
         return self.apply(replace(self.lose_pose(s, doubts_odometry=False), behaviour=None), MissionEvent.FIND)
 
-    def _without_way(self, s: SurveyState, cause: str) -> SurveyState:
+    def _without_way(self, s: SurveyState, cause: Cause) -> SurveyState:
         """No way leads on: the estimate may be wrong, so a fix comes before giving up."""
         if s.is_confirmed:
             return self.fault(replace(s, is_confirmed=False), cause)
@@ -260,7 +261,7 @@ class Survey(HoldRules[SurveyState]):
         return is_long and (follower.is_at_rim(leg.stop) or follower.distance_m(leg.stop, motion.pose) > reach_m)
 
     def _overdue(self, s: SurveyState, stop: Stop) -> SurveyState:
-        return self.fault(s, conditions.LEG_OVERDUE.text(x_m=stop.x_m, y_m=stop.y_m))
+        return self.fault(s, conditions.LEG_OVERDUE.because(x_m=stop.x_m, y_m=stop.y_m))
 
     def _arrive(self, s: SurveyState, motion: StateEstimate) -> Step:
         return self._settle(self.apply(replace(s, behaviour=None), MissionEvent.ARRIVED), motion)
@@ -304,7 +305,7 @@ class Survey(HoldRules[SurveyState]):
             planner, over = self.planner, {*s.done, *s.skipped}
             route = planner.route(deck, due) if due else planner.rejoin(s.route, deck, over)
         except PlanError as error:
-            return self._without_way(s, conditions.NO_WAY_ON.text(why=error))
+            return self._without_way(s, conditions.NO_WAY_ON.because(why=error))
         return replace(s, route=route, stop_index=0, behaviour=None, is_off_route=False, is_confirmed=False)
 
     def _review_time(self, s: SurveyState, motion: StateEstimate) -> tuple[SurveyState, bool]:
@@ -318,7 +319,7 @@ class Survey(HoldRules[SurveyState]):
         going_on = budget.review(progress, motion.t_s, motion.deck, left)
         s = replace(s, budget=progress)
         if going_on is None:
-            cause = s.abort_cause or conditions.TIME_USED_UP.text(budget_s=budget.budget_s)
+            cause = s.abort_cause or conditions.TIME_USED_UP.because(budget_s=budget.budget_s)
             return self.proceed(replace(s, abort_cause=cause)), False
         if going_on is left:
             return s, True
@@ -348,7 +349,7 @@ class Survey(HoldRules[SurveyState]):
 
     def _check_rest(self, s: SurveyState, settling: Settling, motion: StateEstimate) -> SurveyState:
         if settling.is_overdue(motion.t_s):
-            return self.fault(s, conditions.NO_REST.text(v_m_s=motion.speed_m_s, omega_rad_s=motion.rate_rad_s))
+            return self.fault(s, conditions.NO_REST.because(v_m_s=motion.speed_m_s, omega_rad_s=motion.rate_rad_s))
         return replace(s, behaviour=settling)
 
     # -- edge and home ------------------------------------------------------------------------------------------------
@@ -362,7 +363,7 @@ class Survey(HoldRules[SurveyState]):
         if retreat.step is RetreatStep.OVER or (retreat.step is RetreatStep.TURN_AWAY and s.abort_cause):
             return self.apply(replace(s, behaviour=None), MissionEvent.FIND), HOLD_POSITION
         if retreat.step is RetreatStep.STUCK:
-            s = self.hold(s, conditions.STUCK_AT_EDGE.message, by_hand=False)
+            s = self.hold(s, conditions.STUCK_AT_EDGE.because(), by_hand=False)
             return replace(s, stuck_s=motion.t_s), HOLD_POSITION
         return replace(s, behaviour=retreat), MissionCommand(twist)
 
@@ -374,7 +375,7 @@ class Survey(HoldRules[SurveyState]):
             try:
                 stops = self.planner.home(motion.deck)
             except PlanError as error:
-                return self._without_way(s, conditions.NO_WAY_HOME.text(why=error)), HOLD_POSITION
+                return self._without_way(s, conditions.NO_WAY_HOME.because(why=error)), HOLD_POSITION
             return replace(s, behaviour=ReturnHome(stops), is_confirmed=False), HOLD_POSITION
         if home.is_at_base:
             s = self.apply(replace(s, outcome=SurveyOutcome.AT_BASE), MissionEvent.FINISHED)
@@ -421,7 +422,7 @@ class Survey(HoldRules[SurveyState]):
         return SurveyState(
             route=self._route,
             mode=HELD if is_held else IDLE,
-            cause=s.cause if is_held else "",
+            cause=s.cause if is_held else NO_CAUSE,
             hold=Hold(is_held, is_held and s.hold.is_fault and not is_new_run),
             fix=FixNeed.RELOCALIZE,
             heading_legs_left=MOST_LEGS,
@@ -433,7 +434,7 @@ class Survey(HoldRules[SurveyState]):
             **{name: getattr(s, name) for name in _KEPT},
         )
 
-    def _recover(self, s: SurveyState, cause: str, t_s: float) -> SurveyState:
+    def _recover(self, s: SurveyState, cause: Cause, t_s: float) -> SurveyState:
         """Hold and relocalize; repeated divergence is a fault."""
         if s.mode is DONE or s.is_held_by_hand:
             return s
@@ -471,13 +472,13 @@ class Survey(HoldRules[SurveyState]):
         s = replace(s, failures=0 if failures >= limit else failures)
         if point is None:
             if failures >= limit:
-                return self.fault(s, conditions.NOT_FOUND.text(why=cause))
+                return self.fault(s, conditions.NOT_FOUND.because(why=cause))
             if isinstance(s.behaviour, Settling):  # this fix is needed; the robot may not have stood quite still
                 s = replace(s, behaviour=replace(s.behaviour, is_requested=False, is_repeated=True))
             return s
         s = replace(s, failure_causes={**s.failure_causes, point: cause}, due=_without(s.due, point))
         if failures >= limit:
-            s = self.fault(s, conditions.MEASUREMENTS_FAILED.text(count=limit, why=cause))
+            s = self.fault(s, conditions.MEASUREMENTS_FAILED.because(count=limit, why=cause))
         return self._leave_stop(s, point, sigma_rad, is_measured=False)
 
     def _leave_pointless(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:

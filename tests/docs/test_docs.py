@@ -42,7 +42,7 @@ def test_what_holds_the_robot_has_its_row_and_no_row_is_without_use() -> None:
     source = "\n".join(path.read_text(encoding="utf-8") for path in paths)
     calls = r"\b(?:fault|hold|interrupt|abort|_request_hold|Fault|Interrupted|Abort)\((?:self, |s, )?"
     texts = set(re.findall(calls + r'f?"([^"\n]*)"', source))
-    assert texts == {"operator"}, "rows for the others in ccatp/conditions.py, then make docs"
+    assert not texts, "rows for them in ccatp/conditions.py, then make docs"
 
 
 PLACES = {  # where the owner of a condition finds it
@@ -50,7 +50,7 @@ PLACES = {  # where the owner of a condition finds it
     Owner.LOCALIZER: ("localizer.py", "estimation"),
     Owner.MISSION: ("survey", "control", "beacons", "daemon"),
     Owner.FIXES: ("survey", "daemon"),
-    Owner.MAIN: ("daemon",),
+    Owner.MAIN: ("daemon", "survey"),
     Owner.LINK: ("daemon",),
     Owner.OPERATOR: ("daemon",),
 }

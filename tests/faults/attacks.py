@@ -10,6 +10,7 @@ from math import hypot
 
 import numpy as np
 
+from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
 from ccatp.links.robot_messages import Sensors
@@ -135,7 +136,7 @@ class AttackedSurvey(SilRun):
         if self.robot.world.is_fallen:
             wrong.append("fallen")
         is_complete = state.mode is DONE and not state.skipped
-        return Result(one, is_complete, state.cause, wrong)
+        return Result(one, is_complete, text_of(state.cause), wrong)
 
 
 def run_attack(seed: int) -> Result:

@@ -18,6 +18,8 @@ import msgspec
 import pytest
 
 import ccatp
+from ccatp.conditions import text_of
+from ccatp.core import Cause
 from ccatp.daemon.danger_loop import DangerLoop
 from ccatp.daemon.main_loop import MainLoop
 from ccatp.errors import ExitStatus
@@ -220,7 +222,7 @@ async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
             return plan(*args)
 
         mission.survey.planner.rejoin = plan_slowly
-        assert mission.handle(Pause("a test")) is None
+        assert mission.handle(Pause(Cause("a test"))) is None
         await daemon.until(lambda: not daemon.is_driving)
         assert mission.handle(Resume()) is None
         await daemon.until(lambda: bool(planned))
@@ -236,15 +238,15 @@ async def test_frames_that_are_old_for_good_are_reported_as_that_and_are_a_fault
         await daemon.until(lambda: daemon.is_driving)
         begin(daemon.to_main, "delay", "to_client", delay_s=0.3, jitter_s=0.0)
         mission: Any = daemon.main._runner.mission
-        await daemon.until(lambda: mission.state.cause.startswith("frames are 3"))
+        await daemon.until(lambda: text_of(mission.state.cause).startswith("frames are 3"))
         assert not daemon.is_driving
-        assert re.fullmatch(r"frames are 3\d\d ms old \(limit 150 ms\)", mission.state.cause)
+        assert re.fullmatch(r"frames are 3\d\d ms old \(limit 150 ms\)", text_of(mission.state.cause))
         assert not mission.state.is_faulted
         await daemon.until(lambda: mission.state.is_faulted)
-        assert mission.state.cause.endswith("(limit 150 ms), for 3 s")
+        assert text_of(mission.state.cause).endswith("(limit 150 ms), for 3 s")
         assert mission.state.fix is FixNeed.RELOCALIZE
         assert {(entry["level"], entry["text"]) for entry in daemon.events("operator_message")} >= {
-            ("error", mission.state.cause)
+            ("error", text_of(mission.state.cause))
         }
 
 

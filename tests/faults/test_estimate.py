@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial
 from ccatp.core import Twist
@@ -82,7 +83,7 @@ class Broken(MeasuredSurvey):
         super()._serve(frame, dt_s)
         if self.broken_at_s is not None and self.held_at_s is None and self.localizer.is_frozen:
             self.held_at_s = frame.t
-            assert self.mission.state.cause.startswith("filter: ")
+            assert text_of(self.mission.state.cause).startswith("filter: ")
             assert self.mission.state.mode in (
                 MissionState.HELD,
                 MissionState.SETTLING,

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ccatp.conditions import text_of
 from ccatp.control.gate import FanGate
 from ccatp.core import Severity
 from ccatp.survey.events import MissionState, SurveyOutcome
@@ -140,7 +141,7 @@ def test_it_stops_in_time(case: Stop, measured: Measured) -> None:
     assert found.verdict.signal in expected.get("signals", {found.verdict.signal})
     if until is to_its_end:  # held, with its cause, and not waiting for ever
         assert run.mission.state.is_faulted
-        assert expected.get("cause", "") in run.mission.state.cause
+        assert expected.get("cause", "") in text_of(run.mission.state.cause)
         fewest, most = expected.get("holds", (0, inf))
         assert fewest <= entered(run.seen, MissionState.HELD) <= most
         assert run.first(at_s, held(HOLD)).t_s - at_s < expected.get("hold_s", inf)
@@ -202,7 +203,7 @@ def test_an_encoder_that_freezes_in_motion_is_found_at_the_stop(at_s: float, mea
 def test_an_encoder_frozen_at_the_stop(measured: Measured) -> None:
     run = watched(HARD, held(), f"encoder_left stuck at_s={STANDING_S} value=3.3")
     assert (run.seen[-1].verdict.severity, run.seen[-1].verdict.signal) == (HOLD, "encoder_left")
-    assert "frozen" in run.seen[-1].verdict.cause
+    assert "frozen" in text_of(run.seen[-1].verdict.cause)
     assert run.seen[-1].t_s - STANDING_S <= 0.5
     measured("S2", 1e3 * (run.seen[-1].t_s - STANDING_S))
 
@@ -227,7 +228,7 @@ def test_wheels_that_creep_while_they_are_held(speed_m_s: float, measured: Measu
     run = watched(HARD, in_the_next(lambda one: one.verdict.severity is Severity.FAULT), fault)
     late_s = run.first(STANDING_S, held(HOLD)).t_s - (STANDING_S + 0.002 / speed_m_s)  # after 2 mm
     assert late_s <= 0.5
-    assert run.seen[-1].verdict.cause == "the right wheel turns while it is held"
+    assert text_of(run.seen[-1].verdict.cause) == "the right wheel turns while it is held"
     assert run.mission.state.full_fans
     assert run.mission.state.is_faulted
     measured("S7", 1e3 * max(late_s, 0.0))
@@ -355,7 +356,7 @@ def test_three_lines_that_are_no_frames_within_a_tenth_of_a_second_hold(measured
     assert run.denied_s, "the permit stands"
     assert run.denied_s[0] <= DRIVING_S + 0.1
     first = run.first(DRIVING_S, held(HOLD))
-    assert first.verdict.cause == "lines of the robot were no frames"
+    assert text_of(first.verdict.cause) == "lines of the robot were no frames"
     assert first.is_zero
     assert any(one.state is MissionState.MEASURING for one in run.since(first.t_s))
     measured("S4", 1e3 * (run.denied_s[0] - DRIVING_S))
@@ -456,7 +457,7 @@ def test_a_fan_that_gives_too_little_holds_with_full_fans(fault: str, measured: 
     first = run.first(FANS_S, lambda one: one.verdict.severity is Severity.FAULT)
     assert first.is_zero
     assert run.mission.state.is_faulted
-    assert "fan" in run.mission.state.cause
+    assert "fan" in text_of(run.mission.state.cause)
     assert run.mission.state.full_fans
     assert run.parts.thrust.duty == (1.0, 1.0)  # sent; the rehearsal of a faulted mission ends before it arrives
     # The echo has to be low for 0.1 s; what counts is how long after that the wheels get their zero.

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.core import Fix, PointId
 from ccatp.daemon.fix_service import FixRequest
@@ -380,8 +381,8 @@ def refusal(
     try:
         fix = solve_fix(cfg.etalon, 0.0, puck, lengths_m, places)
     except MultilaterationError as error:
-        return scrutiny.refusal_of(lengths_m, puck) if explained_too else str(error)
-    return scrutiny.review(fix, puck, mirror.base_pose, np.diag((4e-6, 4e-6, 1e-4))).refusal
+        return text_of(scrutiny.refusal_of(lengths_m, puck)) if explained_too else str(error)
+    return text_of(scrutiny.review(fix, puck, mirror.base_pose, np.diag((4e-6, 4e-6, 1e-4))).refusal)
 
 
 @pytest.mark.fault("E5")
@@ -416,7 +417,7 @@ def test_a_mission_in_a_wrong_frame_does_not_begin(tmp_path: Path) -> None:
     run = MeasuredSurvey(SURVEY, tmp_path, lambda _m, fix: moved(fix, (0.3, 0.0, 0.0)))
     run.run()
     assert run.mission.state.is_faulted
-    assert run.mission.state.cause == (
+    assert text_of(run.mission.state.cause) == (
         "the laser system sees the robot 0.30 m from its base: no exchange of axes or units explains it; is it at "
         "base, and is this the mirror?"
     )

@@ -16,14 +16,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from ccatp.conditions import GRIP_TOO_LITTLE, text_of
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EmergencyKind, EventCode, Severity, Verdict
+from ccatp.core import Cause, DeckPose, EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.mission_runner import STILL, DriveCommand
 from ccatp.links.channels import format_ok
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.rpc import REPEAT_S, RequestFailed, request
 from ccatp.mirror.mirror import Mirror
-from ccatp.safety.emergency_latch import EmergencyLatch
+from ccatp.safety.emergency_latch import EmergencyLatch, cause_of
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, UnattendedFaultTimer
@@ -131,7 +132,7 @@ def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
 
 def emergency(raised: int, kind: str = "fire", *, code: EventCode = EventCode.ABORTED) -> Verdict:
     is_shaking = kind == "earthquake"
-    verdict = replace(FREE, code=code, cause=f"emergency: {kind}", signal=f"emergency:{kind}", raised=raised)
+    verdict = replace(FREE, code=code, cause=cause_of(EmergencyKind(kind)), signal=f"emergency:{kind}", raised=raised)
     free = not is_shaking or code is EventCode.NEAR_EDGE
     return replace(verdict, is_shaking=is_shaking, forward=free, reverse=free, turn=free)
 
@@ -149,7 +150,7 @@ def test_during_an_earthquake_resume_is_refused(story: Story) -> None:
     story.frame(emergency(1, "earthquake"))
     assert story.state.is_paused
     assert story.mission.handle(Resume()) == NOBODY_RESUMES
-    assert story.mission.handle(Abort("operator")) is None
+    assert story.mission.handle(Abort(Cause("operator"))) is None
     assert story.state.mode is HELD
     story.until_state(DONE)  # it is over
     assert story.state.done == ()
@@ -159,7 +160,7 @@ def test_during_an_earthquake_resume_is_refused(story: Story) -> None:
 def test_an_emergency_that_is_new_outranks_a_pause_and_its_level_does_not(story: Story) -> None:
     story.until_state(DRIVING)
     assert frames(story, emergency(1)) is RETURNING
-    assert story.mission.handle(Pause("operator")) is None
+    assert story.mission.handle(Pause(Cause("operator"))) is None
     # The level; then one of two is cleared: what is left is the older one. Last all are cleared.
     assert frames(story, emergency(1), emergency(1, "power"), count=50) is HELD
     assert frames(story, FREE) is HELD
@@ -172,20 +173,20 @@ def test_an_earthquake_at_an_edge_presses_the_robot_on_and_resume_is_refused(sto
     shaking = emergency(1, "earthquake", code=EventCode.NEAR_EDGE)
     assert frames(story, replace(shaking, off=(True, False, False, False), forward=False)) is BACKING_OFF
     assert story.state.full_fans
-    assert story.mission.handle(Pause("operator")) is None
+    assert story.mission.handle(Pause(Cause("operator"))) is None
     assert story.mission.handle(Resume()) == NOBODY_RESUMES
     assert frames(story, emergency(1, "earthquake")) is HELD
-    assert story.state.cause == "emergency: earthquake"
+    assert text_of(story.state.cause) == "emergency: earthquake"
 
 
 @pytest.mark.fault("O1")
 def test_what_breaks_in_an_earthquake_waits_for_an_operator_when_it_is_over(story: Story) -> None:
     story.until_state(DRIVING)
     shaking = emergency(1, "earthquake")
-    frames(story, shaking, replace(shaking, severity=Severity.FAULT, cause="a wheel runs away", signal="enc"))
+    frames(story, shaking, replace(shaking, severity=Severity.FAULT, cause=GRIP_TOO_LITTLE.because(), signal="grip"))
     assert story.state.is_faulted
     assert frames(story, FREE, count=50) is HELD
-    assert story.state.cause == "a wheel runs away"
+    assert story.state.cause == GRIP_TOO_LITTLE.because()
     assert story.mission.handle(Resume()) is None
     story.until_state(DONE)
     assert story.state.done == ()
@@ -194,8 +195,8 @@ def test_what_breaks_in_an_earthquake_waits_for_an_operator_when_it_is_over(stor
 @pytest.mark.fault("O1")
 def test_after_a_restart_with_nothing_latched_the_first_emergency_is_new(story: Story) -> None:
     """It was on its way home by the operator's abort, and paused, when its predecessor died."""
-    story.mission.handle(Abort("operator"))
-    story.mission.handle(Pause("operator"))
+    story.mission.handle(Abort(Cause("operator")))
+    story.mission.handle(Pause(Cause("operator")))
     story.mission.handle(EmergencyKnown())
     assert frames(story, FREE) is HELD
     assert frames(story, emergency(1)) is RETURNING
@@ -203,7 +204,7 @@ def test_after_a_restart_with_nothing_latched_the_first_emergency_is_new(story: 
 
 @pytest.mark.fault("O1", "O7")
 def test_what_was_latched_before_the_start_is_waited_for_at_base(story: Story) -> None:
-    story.mission.handle(Pause("restarted"))
+    story.mission.handle(Pause(Cause("restarted")))
     story.mission.handle(EmergencyKnown())
     assert frames(story, emergency(4), count=50) is HELD
     assert story.mission.handle(Resume()) == "an emergency of before is latched: 'ccatp clear' it first"
@@ -239,7 +240,7 @@ def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
 ) -> None:
     story.until(lambda: story.state.mode is DRIVING and story.v > 0.09)
     frames(story, FRONT_OFF, count=1 + count)
-    story.mission.handle(Abort("fire"))
+    story.mission.handle(Abort(Cause("fire")))
     begun_s, first = story.t, len(story.orders)
     frames(story, FRONT_OFF, count=20)
     story.until_state(RETURNING)
@@ -255,7 +256,7 @@ def drive(config: Config, mirror: Mirror, aborts: list[int]) -> list[MissionComm
     story = Story(config, mirror)
     for k in range(900):
         if k in aborts:
-            story.mission.handle(Abort("fire"))
+            story.mission.handle(Abort(Cause("fire")))
         story.frame()
     return story.orders
 
@@ -403,7 +404,7 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
 ) -> None:
     cfg = config.health
     story.until_state(DRIVING)
-    story.mission.handle(Fault("leg overdue"))
+    story.mission.handle(Fault(Cause("leg overdue")))
     vigil = UnattendedFaultTimer(config, falls=True)
     reminders: list[float] = []
     soc, drain = 0.5, 1.0 / cfg.battery_life_s
@@ -415,7 +416,7 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
         if call is FaultAction.REMIND:
             reminders.append(t_s)
         elif call is FaultAction.RETURN:
-            story.mission.handle(Abort("nobody came"))
+            story.mission.handle(Abort(Cause("nobody came")))
     at_dock = soc - home_s * drain
     measured("O8", (soc - cfg.battery_reserve) / (home_s * drain))
     measured("F6", 100.0 * at_dock)

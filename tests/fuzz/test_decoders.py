@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ccatp.core import EventCode, Verdict
+from ccatp.core import Cause, EventCode, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links import channels, multiline, topics
 from ccatp.links import robot_codec as robot
@@ -53,7 +53,7 @@ CLIENTS = b"""[clients.site]
 public_key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
 role = "raise"
 """
-VERDICT = Verdict(7, 0.07, EventCode.NEAR_EDGE, "rim ahead", "front_left", 0.01, 0.0, False, True, False)
+VERDICT = Verdict(7, 0.07, EventCode.NEAR_EDGE, Cause("rim_ahead"), "front_left", 0.01, 0.0, False, True, False)
 
 
 def targets() -> list[Target]:

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from ccatp.config.models import Config
 from ccatp.control.gate import FanGate, Purpose
-from ccatp.core import EdgeSample, EventCode, PointId, Stop, Twist, Verdict, WheelSample, twist_of
+from ccatp.core import Cause, EdgeSample, EventCode, PointId, Stop, Twist, Verdict, WheelSample, twist_of
 from ccatp.daemon.mission_runner import STILL, TimedFrame
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixRefused
@@ -131,7 +131,7 @@ class Stage(SilRun):
             self.monitor.emergency(kind, number)
 
     def abort(self) -> None:
-        if self.mission.handle(Abort("operator")) is None:
+        if self.mission.handle(Abort(Cause("operator"))) is None:
             self.aborts += 1
 
     # -- frames -------------------------------------------------------------------------------------------------------
@@ -294,7 +294,7 @@ class Stage(SilRun):
     def look_at_hold(self) -> None:
         """I9: whatever it was at, a pause holds it before its next frame, and that frame drives nothing."""
         was_over = self.mission.state.mode is DONE
-        self.mission.handle(Pause("I9"))
+        self.mission.handle(Pause(Cause("I9")))
         assert self.mission.state.mode is (DONE if was_over else HELD), "I9"
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import ccatp
-from ccatp.core import EventCode, Verdict
+from ccatp.core import NO_CAUSE, EventCode, Verdict
 from ccatp.daemon.danger_loop import build_safety_monitor
 from ccatp.danger import DangerMonitor
 from ccatp.links.beacon_messages import BeaconFrame
@@ -25,7 +25,7 @@ permits = st.tuples(st.booleans(), st.booleans(), st.booleans())
 
 
 def verdict_on(frame: FrameId, allowed: tuple[bool, bool, bool] = ALL) -> Verdict:
-    return Verdict(frame.seq, frame.t_s, EventCode.NORMAL, "", "", 0.0, 0.0, *allowed)
+    return Verdict(frame.seq, frame.t_s, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, *allowed)
 
 
 @given(frames, frames, permits)

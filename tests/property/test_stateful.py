@@ -13,10 +13,24 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 from msgspec.structs import replace
 
-from ccatp.conditions import Action
+from ccatp.conditions import (
+    BATTERY_LOW,
+    EARTHQUAKE,
+    EDGE_SENSOR_STAYS_OFF,
+    EDGE_STALE,
+    FANS_REFUSED,
+    FILTER_DIVERGED,
+    FRAMES_LOST,
+    GRIP_TOO_LITTLE,
+    NO_FRAME_FOR,
+    OPERATOR,
+    SAMPLES_TOO_FEW,
+    WHEELS_STAND,
+    Action,
+)
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import EmergencyKind, EventCode, Severity, Twist, Verdict
+from ccatp.core import Cause, EmergencyKind, EventCode, Severity, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.events import (
@@ -196,28 +210,27 @@ def test_invariants_in_very_many_orders_of_events(measured: Callable[[str, float
 # -- the pure step of a survey -----------------------------------------------------------------------------------------
 
 DENIED = replace(FREE, forward=False, reverse=False, turn=False)
-SHAKEN = replace(
-    DENIED, code=EventCode.ABORTED, cause=f"emergency: {EmergencyKind.EARTHQUAKE}", raised=1, is_shaking=True
-)
-HOLD = replace(DENIED, severity=Severity.HOLD, cause="a wheel is blocked", signal="enc")
-STAYS_OFF = replace(HOLD, cause="an edge sensor stays off", signal="front_left", code=EventCode.NEAR_EDGE)
+SHAKEN = replace(DENIED, code=EventCode.ABORTED, cause=EARTHQUAKE.because(), raised=1, is_shaking=True)
+HOLD = replace(DENIED, severity=Severity.HOLD, cause=WHEELS_STAND.because(), signal="encoders")
+STAYS_OFF = replace(HOLD, cause=EDGE_SENSOR_STAYS_OFF.because(), signal="front_left", code=EventCode.NEAR_EDGE)
 VERDICTS: dict[str, Verdict | None] = {
     "free": FREE,
     "none": None,
-    "stale": replace(DENIED, severity=Severity.PAUSE, cause="edge samples stale"),
+    "stale": replace(DENIED, severity=Severity.PAUSE, cause=EDGE_STALE.because()),
     "edge": FRONT_OFF,
     "edge, data missing": replace(FRONT_OFF, reverse=False),
-    "slow": replace(FREE, severity=Severity.SLOW, cause="one sensor is slow"),
+    "slow": replace(FREE, severity=Severity.SLOW, cause=SAMPLES_TOO_FEW.because()),
     "hold": HOLD,
     "sensor stays off": STAYS_OFF,
-    "low battery": replace(FREE, severity=Severity.RETURN, cause="the battery"),
-    "low battery at the edge": replace(FRONT_OFF, severity=Severity.RETURN, cause="the battery"),
-    "fault": replace(DENIED, severity=Severity.FAULT, cause="a wheel runs away"),
+    "low battery": replace(FREE, severity=Severity.RETURN, cause=BATTERY_LOW.because()),
+    "low battery at the edge": replace(FRONT_OFF, severity=Severity.RETURN, cause=BATTERY_LOW.because()),
+    "fault": replace(DENIED, severity=Severity.FAULT, cause=GRIP_TOO_LITTLE.because()),
     "fire": ABORT,
     "earthquake": SHAKEN,
     "earthquake at the edge": replace(FRONT_OFF, raised=1, is_shaking=True),
-    "earthquake and fault": replace(SHAKEN, severity=Severity.FAULT, cause="a wheel runs away"),
-    "earthquake and low battery": replace(SHAKEN, severity=Severity.RETURN, cause="the battery"),
+    "earthquake and fault": replace(SHAKEN, severity=Severity.FAULT, cause=GRIP_TOO_LITTLE.because()),
+    "of a newer version": replace(FREE, cause=Cause("mirror_on_fire")),
+    "earthquake and low battery": replace(SHAKEN, severity=Severity.RETURN, cause=BATTERY_LOW.because()),
 }
 STILL = Twist(0.0, 0.0)
 
@@ -233,10 +246,14 @@ def events(s: SurveyState, t_s: float, rng: random.Random) -> list[SurveyInput]:
     if rng.random() < 0.01:
         found.append(
             rng.choice(
-                (Pause("operator"), Resume(), Resume(), Abort("operator"), Interrupted("late"), Fault("x"),
-                 Fault("y", loses_pose=True), EstimateDiverged("filter: z", t_s), TrackingGap())
+                (
+                    *(Pause(OPERATOR.because()), Resume(), Resume(), Abort(OPERATOR.because())),
+                    *(Interrupted(NO_FRAME_FOR.because(age_s=1.0)), Fault(FRAMES_LOST.because())),
+                    Fault(FANS_REFUSED.because(why="y"), loses_pose=True),
+                    *(EstimateDiverged(FILTER_DIVERGED.because(why="z"), t_s), TrackingGap()),
+                )
             )
-        )  # fmt: skip
+        )
     return found
 
 

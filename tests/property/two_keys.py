@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from ccatp.core import EventCode, Verdict
+from ccatp.core import NO_CAUSE, EventCode, Verdict
 from ccatp.links.frame_answers import DriveRule, FrameId, PermitRule, is_restart
 from ccatp.links.robot_messages import Drive, Join, Permit, RobotData, Role
 from ccatp.onboard.rules import LinkedRobot
@@ -444,7 +444,7 @@ class World:
         if danger.rule.take(known):
             danger.allowed = answer
             if answer is not None:
-                danger.rule.judge(Verdict(known.seq, known.t_s, EventCode.NORMAL, "", "", 0.0, 0.0, *answer))
+                danger.rule.judge(Verdict(known.seq, known.t_s, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, *answer))
             if frame.is_present and frame.seq <= danger.highest:
                 raise Violation(f"frame {frame.seq} is judged twice")
             danger.highest = frame.seq if frame.is_present else danger.highest

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import msgspec
 import numpy as np
 
+from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import DeckPose, Fix, PointId, Severity, Vector3, Verdict
@@ -227,7 +228,7 @@ class Desk:
         elif isinstance(event, FixFailed):
             self.failed.append(event.cause)
         elif isinstance(event, Fault):
-            self.faults.append(event.cause)
+            self.faults.append(text_of(event.cause))
             self.faulted.set()
 
     def begin(self, point: PointId, expected_m: Vector3 = (0.0, 0.0, 0.0)) -> None:

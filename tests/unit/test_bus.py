@@ -7,7 +7,7 @@ import msgspec
 import pytest
 import zmq
 
-from ccatp.core import EventCode, Verdict
+from ccatp.core import Cause, EventCode, Verdict
 from ccatp.links.bus import BadMessage, Publisher, Subscriber, unpack
 from ccatp.links.topics import (
     BY_NAME,
@@ -169,7 +169,8 @@ def test_names_are_unique_and_levels_have_an_age() -> None:
 
 
 def test_verdicts_survive_the_bus() -> None:
-    verdict = Verdict(7, 0.07, EventCode.NEAR_EDGE, "rim", "front_left", 0.01, 0.005, False, True, False, (True,) * 4)
+    cause = Cause("leg_overdue", {"x_m": 1.5}, besides=Cause("no_estimate"))
+    verdict = Verdict(7, 0.07, EventCode.NEAR_EDGE, cause, "front_left", 0.01, 0.005, False, True, False, (True,) * 4)
     name, _, message = unpack(b"verdict " + msgspec.json.encode(verdict))
     assert (name, message) == ("verdict", verdict)
     assert isinstance(message, Verdict)

@@ -185,14 +185,15 @@ def test_the_table() -> None:
 
 
 def test_what_holds_the_robot_is_shown_with_severity_duration_and_advice() -> None:
-    wheel = {**STATUS, "state": "held", "cause": WHEEL_BLOCKED.text(side="left"), "t_s": 95.0, "since_s": 20.0}
+    cause = {"condition": WHEEL_BLOCKED.name, "cause": "the left wheel is blocked"}
+    wheel = {**STATUS, **cause, "state": "held", "t_s": 95.0, "since_s": 20.0}
     shown = dict(status_rows(wheel))
     assert (shown["severity"], shown["for"], shown["what to do"]) == ("hold", "1:15", WHEEL_BLOCKED.advice)
     assert dict(status_rows({**wheel, "severity": int(Severity.FAULT)}))["severity"] == "fault"  # it has escalated
-    paused = dict(status_rows({**wheel, "cause": "operator"}))
+    paused = dict(status_rows({**wheel, "condition": "operator", "cause": "operator"}))
     assert "severity" not in paused
     assert paused["what to do"].startswith("`ccatp resume`")
-    assert "what to do" not in dict(status_rows({**wheel, "cause": "nobody knows this"}))
+    assert "what to do" not in dict(status_rows({**wheel, "condition": "of_another_version"}))
 
 
 def test_one_line() -> None:

@@ -19,9 +19,9 @@ from markdown_it.token import Token
 
 import ccatp
 from ccatp.cli import cli
+from ccatp.conditions import danger_text
 from ccatp.config import package
 from ccatp.config.load import load_config
-from ccatp.core import danger_text
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 from tests.unit.dashboard.test_view import ALL, metrics_of
 
@@ -58,19 +58,20 @@ def test_a_message_is_one_line_and_that_of_the_first_problem() -> None:
 
 
 @pytest.mark.parametrize(
-    ("cause", "signal", "value", "limit", "text"),
+    ("condition", "cause", "signal", "value", "limit", "text"),
     [
-        ("no estimate", "estimate", 0.15, 0.15, "no estimate: limit 0.15 s"),
-        ("estimate stale", "estimate", 0.31, 0.15, "estimate stale: 0.31 s (limit 0.15 s)"),
-        ("edge samples stale", "edge", 0.2, 0.1, "edge samples stale: 0.2 s (limit 0.1 s)"),
-        ("lifted or fallen", "edge", 4.0, 3.0, "lifted or fallen (edge): 4 (limit 3)"),
-        ("the left wheel runs away", "left_wheel", 0.5, 0.1, "the left wheel runs away: 0.5 (limit 0.1)"),
-        ("emergency: fire", "emergency:fire", 1.0, 0.0, "emergency: fire"),
-        ("", "", 0.0, 0.0, ""),
+        ("no_estimate", "no estimate", "estimate", 0.15, 0.15, "no estimate: limit 0.15 s"),
+        ("estimate_stale", "estimate stale", "estimate", 0.31, 0.15, "estimate stale: 0.31 s (limit 0.15 s)"),
+        ("edge_stale", "edge samples stale", "edge", 0.2, 0.1, "edge samples stale: 0.2 s (limit 0.1 s)"),
+        ("all_off", "lifted or fallen", "edge", 4.0, 3.0, "lifted or fallen (edge): 4 (limit 3)"),
+        ("wheel_runs_away", "left wheel fast", "left_wheel", 0.5, 0.1, "left wheel fast: 0.5 (limit 0.1)"),
+        ("emergency", "emergency: fire", "emergency:fire", 1.0, 0.0, "emergency: fire"),
+        ("", "", "", 0.0, 0.0, ""),
+        ("of_another_version", "it burns", "estimate", 2.0, 1.0, "it burns (estimate): 2 (limit 1)"),
     ],
 )
-def test_what_where_how_much(cause: str, signal: str, value: float, limit: float, text: str) -> None:
-    assert danger_text(cause, signal, value, limit) == text
+def test_what_where_how_much(condition: str, cause: str, signal: str, value: float, limit: float, text: str) -> None:
+    assert danger_text(condition, cause, signal, value, limit) == text
 
 
 # -- nothing that is read, from a file or from a peer, may become code -------------------------------------------------

@@ -7,9 +7,17 @@ from weakref import ReferenceType, ref
 
 import pytest
 
-from ccatp.conditions import BEYOND_SEAM, CENTRE_NEAR_RIM, EDGE_SENSOR_CHATTERS, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD
+from ccatp.conditions import (
+    BEYOND_SEAM,
+    CENTRE_NEAR_RIM,
+    EDGE_SENSOR_CHATTERS,
+    NO_SEAM,
+    OFF_WITHOUT_WHEELS,
+    RIM_AHEAD,
+    text_of,
+)
 from ccatp.config.models import Config
-from ccatp.core import Corner, EdgeSample, EventCode, Verdict, WheelSample
+from ccatp.core import NO_CAUSE, Corner, EdgeSample, EventCode, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
@@ -115,7 +123,7 @@ def permits(verdict: Verdict) -> tuple[bool, bool, bool]:
 
 def test_normal_operation_permits_everything(on_panel: Story) -> None:
     verdict = on_panel.run(3, v=0.1)
-    assert verdict == Verdict(3, verdict.t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+    assert verdict == Verdict(3, verdict.t_s, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
     assert on_panel.monitor.counts["episodes"] == dict.fromkeys(Corner, 0)
 
 
@@ -130,7 +138,11 @@ def test_a_rim_is_an_edge_at_the_second_off_sample(at_rim: Story) -> None:
     verdict = at_rim.frame(0.1, off=FRONT, flags="1111111100")
     assert verdict.code is EventCode.NORMAL  # not moved far enough to have a direction
     verdict = at_rim.frame(0.1, off=FRONT)
-    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NEAR_EDGE, RIM_AHEAD.message, "front_left")
+    assert (verdict.code, text_of(verdict.cause), verdict.signal) == (
+        EventCode.NEAR_EDGE,
+        RIM_AHEAD.message,
+        "front_left",
+    )
     assert verdict.value < 0.0005  # m of travel: three samples at 0.1 m/s
     assert permits(verdict) == (False, True, False)
     assert verdict.off == (True, True, False, False)
@@ -171,7 +183,7 @@ def test_a_seam_allows_its_width_and_then_is_an_edge(at_seam: Story) -> None:
     verdict = at_seam.run(14, v=0.1, off=FRONT)  # 14 mm: gap 10 + tolerance 1 + extra 3, less the first sample
     assert verdict.code is EventCode.NORMAL
     verdict = at_seam.frame(0.1, off=FRONT)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
+    assert (verdict.code, text_of(verdict.cause)) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
     assert verdict.limit == pytest.approx(0.014, abs=1e-6)  # m; the direction is along the normal to 1e-3 rad
     assert verdict.value == pytest.approx(0.014, abs=2e-4)  # m; two samples at 0.1 m/s
 
@@ -191,7 +203,7 @@ def test_without_an_estimate_no_seam_is_assumed_and_nothing_is_permitted(at_seam
     at_seam.has_estimate = False
     verdict = at_seam.run(6, v=0.1, off=FRONT)
     assert verdict.code is EventCode.NEAR_EDGE
-    assert verdict.cause == f"{NO_SEAM.message}; no estimate"
+    assert text_of(verdict.cause) == f"{NO_SEAM.message}; no estimate"
     assert permits(verdict) == NO_PERMIT
 
 
@@ -226,7 +238,7 @@ def test_an_edge_that_a_fix_shows_to_be_a_seam_was_none(at_seam: Story) -> None:
     assert permits(at_seam.run(4, v=0.1, off=FRONT)) == ANY_PERMIT
     # A seam, and no more: its width and tolerances are allowed once.
     verdict = at_seam.run(12, v=0.1, off=FRONT)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
+    assert (verdict.code, text_of(verdict.cause)) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
     # Without another fix that stays so, however long it stands.
     assert at_seam.run(200, off=FRONT).code is EventCode.NEAR_EDGE
 
@@ -270,7 +282,7 @@ def test_a_turn_across_a_seam_allows_its_width(cfg: Config, mirror: Mirror) -> N
     story = Story(cfg, mirror, (panel.x_m + panel.half_x_m + 1e-4, panel.y_m, -pi / 4))
     assert story.run(10, omega=1.0, off=FR).code is EventCode.NORMAL  # 12.7 mm of arc
     verdict = story.run(2, omega=1.0, off=FR)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
+    assert (verdict.code, text_of(verdict.cause)) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
     assert verdict.limit == pytest.approx(0.014, abs=1e-9)  # m; 10 + 1 + 3 mm
 
 
@@ -299,7 +311,7 @@ def test_a_silent_wheel_permits_nothing_and_counts_as_fastest(on_panel: Story, b
         verdict = monitor.step(frame_of(100 + k, t_s, enc, [EdgeSample(t_s, 1, 1, 1, 1)]), estimate)
         if k <= 14:
             assert permits(verdict) == ANY_PERMIT  # the last sample is held for 150 ms
-    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NORMAL, "encoder samples stale", "enc")
+    assert (verdict.code, text_of(verdict.cause), verdict.signal) == (EventCode.NORMAL, "encoder samples stale", "enc")
     assert permits(verdict) == NO_PERMIT
     assert verdict.value == pytest.approx(0.17, abs=1e-9)  # s; sums of time steps
     t_s += 0.001
@@ -307,7 +319,7 @@ def test_a_silent_wheel_permits_nothing_and_counts_as_fastest(on_panel: Story, b
         frame_of(200, t_s, [], [EdgeSample(t_s, 0, 1, 1, 1), EdgeSample(t_s + 1e-3, 0, 1, 1, 1)]), None
     )
     assert verdict.code is EventCode.NEAR_EDGE
-    assert verdict.cause.startswith(OFF_WITHOUT_WHEELS.message)
+    assert text_of(verdict.cause).startswith(OFF_WITHOUT_WHEELS.message)
     assert verdict.value > 0.06  # m: 0.17 s at the 0.41 m/s of a corner sensor with one wheel against the other
 
 
@@ -317,7 +329,7 @@ def test_a_silent_wheel_permits_nothing_and_counts_as_fastest(on_panel: Story, b
 def test_all_four_off_is_lifted_or_fallen(on_panel: Story) -> None:
     assert on_panel.frame(off=ALL, flags="1111111110").code is EventCode.NORMAL
     verdict = on_panel.frame(off=ALL, flags="0111111111")
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, "lifted or fallen")
+    assert (verdict.code, text_of(verdict.cause)) == (EventCode.NEAR_EDGE, "lifted or fallen")
     assert permits(verdict) == NO_PERMIT
     assert verdict.off == (True, True, True, True)
     assert on_panel.frame().code is EventCode.NEAR_EDGE
@@ -332,7 +344,11 @@ def test_the_centre_may_not_drive_at_the_rim(at_rim: Story) -> None:
     at_rim.pose = (x + 0.045, y, 0.0)  # 46 mm from the rim, and the sensors see nothing
     assert at_rim.frame(0.1).code is EventCode.NORMAL
     verdict = at_rim.run(3, v=0.1)
-    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NEAR_EDGE, CENTRE_NEAR_RIM.message, "estimate")
+    assert (verdict.code, text_of(verdict.cause), verdict.signal) == (
+        EventCode.NEAR_EDGE,
+        CENTRE_NEAR_RIM.message,
+        "estimate",
+    )
     assert permits(verdict) == (False, True, False)
     assert verdict.off == (True, True, False, False)
     assert verdict.value < verdict.limit == pytest.approx(0.0453, abs=1e-9)  # m; half the lead and three sigma
@@ -349,7 +365,7 @@ def test_the_centre_may_leave_the_rim_in_either_direction(at_rim: Story) -> None
     assert verdict.off == (False, False, True, True)
     at_rim.has_estimate = False
     verdict = at_rim.run(20)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, f"{CENTRE_NEAR_RIM.message}; no estimate")
+    assert (verdict.code, text_of(verdict.cause)) == (EventCode.NEAR_EDGE, f"{CENTRE_NEAR_RIM.message}; no estimate")
     assert permits(verdict) == NO_PERMIT
 
 
@@ -379,7 +395,7 @@ def test_an_estimate_that_is_not_finite_is_none(on_panel: Story, field_name: str
     t_s = on_panel.t + 1e-3
     frame = frame_of(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
     verdict = on_panel.monitor.step(frame, estimate)
-    assert (verdict.cause, verdict.value) == ("estimate not finite", 0.15)
+    assert (text_of(verdict.cause), verdict.value) == ("estimate not finite", 0.15)
     assert permits(verdict) == NO_PERMIT
     assert not on_panel.monitor.at_base_or_held
 
@@ -393,19 +409,24 @@ def test_the_age_of_an_estimate(on_panel: Story, age_s: float, expected: tuple[b
     frame = frame_of(99, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
     verdict = on_panel.monitor.step(frame, estimate)
     assert permits(verdict) == expected
-    assert verdict.cause == ("" if expected[0] else "estimate stale")
+    assert text_of(verdict.cause) == ("" if expected[0] else "estimate stale")
 
 
 def test_every_value_is_finite_before_the_first_reception(on_panel: Story) -> None:
     edge = [EdgeSample(1e-3 * k, 0, 0, 0, 1) for k in range(1, 4)]
     verdict = on_panel.monitor.step(frame_of(1, 0.003, [], edge), None)
-    assert verdict.cause == f"{OFF_WITHOUT_WHEELS.message}; encoder samples stale"
+    assert text_of(verdict.cause) == f"{OFF_WITHOUT_WHEELS.message}; encoder samples stale"
     assert verdict.value == pytest.approx(0.061, abs=1e-3)  # m: 0.15 s at 0.41 m/s
 
 
 def test_no_frame_permits_nothing_whatever_the_code(at_rim: Story) -> None:
     verdict = at_rim.monitor.stale(7, 1.5)
-    assert (verdict.seq, verdict.t_s, verdict.code, verdict.cause) == (7, 1.5, EventCode.NORMAL, "no sensors frame")
+    assert (verdict.seq, verdict.t_s, verdict.code, text_of(verdict.cause)) == (
+        7,
+        1.5,
+        EventCode.NORMAL,
+        "no sensors frame",
+    )
     assert permits(verdict) == NO_PERMIT
     at_rim.monitor.emergency("fire", "a")
     assert at_rim.monitor.stale(7, 1.5).code is EventCode.ABORTED
@@ -420,7 +441,7 @@ def test_a_frame_that_is_not_new_is_not_judged_and_permits_nothing(at_rim: Story
     t_s = at_rim.t
     again = frame_of(2, t_s, [WheelSample(t_s, 9.0, 9.0)], [EdgeSample(t_s + 1e-3 * k, 0, 0, 0, 0) for k in range(5)])
     found = at_rim.monitor.step(again, None)
-    assert (permits(found), found.cause) == (NO_PERMIT, "no sensors frame")
+    assert (permits(found), text_of(found.cause)) == (NO_PERMIT, "no sensors frame")
     assert at_rim.monitor.verdict is last
     assert at_rim.monitor._edges.is_idle
 
@@ -457,7 +478,11 @@ def test_reset_begins_a_new_session_and_keeps_the_abort(at_rim: Story) -> None:
 def test_an_emergency_is_code_2_with_motion_permitted(on_panel: Story) -> None:
     assert on_panel.monitor.emergency("fire", "a", "smoke") is None
     verdict = on_panel.run(1)
-    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.ABORTED, "emergency: fire", "emergency:fire")
+    assert (verdict.code, text_of(verdict.cause), verdict.signal) == (
+        EventCode.ABORTED,
+        "emergency: fire",
+        "emergency:fire",
+    )
     assert permits(verdict) == ANY_PERMIT
     assert on_panel.monitor.clear("a", at_base_or_held=True) is None
     assert on_panel.run(1).code is EventCode.NORMAL
@@ -467,11 +492,11 @@ def test_nothing_moves_while_the_ground_shakes(on_panel: Story) -> None:
     on_panel.monitor.emergency("earthquake", "a")
     on_panel.monitor.emergency("fire", "b")
     verdict = on_panel.run(1)
-    assert (verdict.code, verdict.cause) == (EventCode.ABORTED, "emergency: earthquake")
+    assert (verdict.code, text_of(verdict.cause)) == (EventCode.ABORTED, "emergency: earthquake")
     assert permits(verdict) == NO_PERMIT
     assert on_panel.monitor.clear("a", at_base_or_held=True) is None
     verdict = on_panel.run(1)
-    assert (verdict.cause, permits(verdict)) == ("emergency: fire", ANY_PERMIT)
+    assert (text_of(verdict.cause), permits(verdict)) == ("emergency: fire", ANY_PERMIT)
 
 
 def test_an_edge_outranks_an_abort(at_rim: Story) -> None:
@@ -488,7 +513,7 @@ def test_a_stale_estimate_holds_an_aborted_robot_too(on_panel: Story) -> None:
     on_panel.monitor.emergency("power", "a")
     on_panel.has_estimate = False
     verdict = on_panel.run(1)
-    assert (verdict.code, verdict.cause) == (EventCode.ABORTED, "no estimate")
+    assert (verdict.code, text_of(verdict.cause)) == (EventCode.ABORTED, "no estimate")
     assert permits(verdict) == NO_PERMIT
 
 
@@ -624,4 +649,4 @@ def test_a_sensor_that_chatters_is_found_while_its_episode_is_open(on_panel: Sto
     cfg = on_panel.cfg
     on_panel.monitor = DangerMonitor(on_panel.mirror, cfg.robot, cfg.danger, cfg.health)
     found = [on_panel.frame(off=FL, flags="1010101010") for _ in range(20)]
-    assert EDGE_SENSOR_CHATTERS.message in {verdict.cause for verdict in found}
+    assert EDGE_SENSOR_CHATTERS.message in {text_of(verdict.cause) for verdict in found}

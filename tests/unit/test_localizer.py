@@ -6,6 +6,7 @@ from math import atan, cos, hypot, inf, nan, pi, sin
 import numpy as np
 import pytest
 
+from ccatp.conditions import text_of
 from ccatp.core import EdgeSample, ImuSample, PanelId, PanelPose, WheelSample
 from ccatp.estimation.localizer_base import FilterWrap, unwrapped
 from ccatp.estimation.odometry import Odometer, OdometryPose, arc_step
@@ -282,7 +283,7 @@ def test_a_diverged_filter_freezes_the_pose_until_the_next_fix() -> None:
     localizer.step(*world.frame())
     assert localizer.is_frozen
     assert localizer.hold_cause
-    assert localizer.hold_cause == "filter: for the sake of the test"
+    assert text_of(localizer.hold_cause) == "filter: for the sake of the test"
     pose = localizer.pose
     filter_.is_broken = False
     run(localizer, world.frames(0.5))
@@ -307,7 +308,7 @@ def test_an_impossible_speed_freezes_instead_of_moving(left: float) -> None:
     localizer.step(0.31, [], [WheelSample(0.31, rate, left * rate)], [])
     assert localizer.is_frozen
     assert localizer.pose == pose
-    assert localizer.hold_cause.endswith("more than the wheels can do")
+    assert text_of(localizer.hold_cause).endswith("more than the wheels can do")
 
 
 @pytest.mark.fault("S4")
@@ -355,7 +356,7 @@ def test_five_backward_frames_in_a_row_ask_for_a_hold() -> None:
     for k in range(5):
         assert not localizer.hold_cause
         localizer.step(*frames[-2 - k])
-    assert localizer.hold_cause == "time stamps of the frames run backward"
+    assert text_of(localizer.hold_cause) == "time stamps of the frames run backward"
 
 
 @pytest.mark.fault("S11")
@@ -369,7 +370,7 @@ def test_five_backward_samples_in_a_row_ask_for_a_hold(source: str) -> None:
         imu = [ImuSample(t, 0.0, 0.0)] if source == "imu" else []
         right, left = (0.0 if source == name else None for name in ("right encoder", "left encoder"))
         localizer.step(0.21 + 0.01 * k, imu, [] if imu else [WheelSample(t, right, left)], [])
-    assert localizer.hold_cause == f"time stamps of the {source} run backward"
+    assert text_of(localizer.hold_cause) == f"time stamps of the {source} run backward"
     assert localizer.counts["backward"] == 5
     localizer.clear_hold()
     assert not localizer.hold_cause

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 import msgspec
 
-from ccatp.core import danger_text
+from ccatp.conditions import danger_text
 from ccatp.links.bus import BadMessage
 from ccatp.links.liveness import kind_of
 from ccatp.links.topics import OPERATOR_MESSAGE, Message
@@ -206,6 +206,7 @@ class LogEntry(msgspec.Struct):
     level: str = "info"
     text: str = ""
     cause: str = ""
+    condition: str = ""
     signal: str = ""
     value: float = 0.0
     limit: float = 0.0
@@ -259,7 +260,7 @@ class RunFiles:
         if entry.event == OPERATOR_MESSAGE:
             self._lines.add(entry.timestamp, entry.level, entry.text)
         elif entry.event in SHOWN_EVENTS and entry.cause:
-            text = danger_text(entry.cause, entry.signal, entry.value, entry.limit)
+            text = danger_text(entry.condition, entry.cause, entry.signal, entry.value, entry.limit)
             self._lines.add(entry.timestamp, "warning", f"danger: {text}")
 
 

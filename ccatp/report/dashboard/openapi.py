@@ -100,6 +100,7 @@ def description() -> Schema:
     _, schemas = msgspec.json.schema_components(
         (MissionStatus, DisplayState, Verdict, Alarm), ref_template="#/components/schemas/{name}"
     )
+    schemas["Verdict"]["properties"] |= {"cause": _TEXT, "condition": _TEXT}
     schemas["Error"] = _object("status", "message", status={"const": "error"}, message=_TEXT)
     schemas["Status"] = _object("status", *_LEVELS, status=_OK, **_LEVELS)
     paths: Schema = {}

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 import ccatp
-from ccatp.conditions import OPERATOR, condition_of
-from ccatp.core import EmergencyKind, Verdict, danger_text
+from ccatp.conditions import OPERATOR, danger_text, text_of
+from ccatp.core import EmergencyKind, Verdict
 from ccatp.links import topics
 from ccatp.links.liveness import Liveness
 from ccatp.links.robot_messages import Sensors
@@ -308,13 +308,16 @@ class RunStateView:
                 "next_point": self._next_point(status),
                 "not_to_be_measured": sum(map(len, status.left_out.values())),
                 "finish_in_s": self._finish_in_s(status, now_s),
-                "is_by_operator": status.cause != "" and condition_of(status.cause) is OPERATOR,
+                "is_by_operator": status.condition == OPERATOR.name,
             }
         verdict: dict[str, Any] | None = None
         if (v := self._verdict) is not None:
-            verdict = msgspec.to_builtins(v) | {"text": danger_text(v.cause, v.signal, v.value, v.limit)}
+            verdict = msgspec.to_builtins(v)
             if isinstance(v, Verdict):
+                verdict |= {"cause": text_of(v.cause), "condition": v.cause.condition}
                 verdict["is_stale"] = is_stale(self._verdict_s)
+            cause = verdict["condition"], verdict["cause"]
+            verdict["text"] = danger_text(*cause, v.signal, v.value, v.limit)
         return {
             "tick": self._ticks,
             "is_sim": self._is_sim,

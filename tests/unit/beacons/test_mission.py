@@ -14,9 +14,9 @@ from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, Pose
 from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.store import BeaconStore, BeaconStoreError
-from ccatp.conditions import ENCODERS_STALE
+from ccatp.conditions import ENCODERS_STALE, RADIO_SILENT, text_of
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import EventCode, Severity, Verdict
+from ccatp.core import NO_CAUSE, Cause, EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.links.robot_codec import BadLine, decode_from_robot
@@ -31,8 +31,8 @@ from ccatp.survey.events import DONE, HELD, VISITING, Abort, Fault, Pause, Resum
 from ccatp.survey.state import HoldState
 from tests.support.scenario import radio_config_of
 
-FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
-DENIED = Verdict(0, 0.0, EventCode.NORMAL, "no radio", "radio", 8.0, 7.0, False, False, False, severity=Severity.HOLD)
+FREE = Verdict(0, 0.0, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+DENIED = RADIO_SILENT.found("radio", 8.0, 7.0).verdict(0, 0.0, EventCode.NORMAL)
 
 
 def play(stage: BeaconSilWorld, until_s: float = 1e9) -> BeaconSilWorld:
@@ -59,7 +59,7 @@ def stage() -> BeaconSilWorld:
 
 
 def test_pause_holds_until_resume(stage: BeaconSilWorld) -> None:
-    assert stage.mission.handle(Pause("operator")) is None
+    assert stage.mission.handle(Pause(Cause("operator"))) is None
     play(stage, until_s=15.0)
     assert stage.mission.state.is_paused
     assert set(stage.found.speeds_m_s[101:]) == {0.0}
@@ -69,8 +69,8 @@ def test_pause_holds_until_resume(stage: BeaconSilWorld) -> None:
 
 
 def test_abort_goes_to_the_start_also_out_of_a_pause(stage: BeaconSilWorld) -> None:
-    stage.mission.handle(Pause("operator"))
-    assert stage.mission.handle(Abort("operator")) is None
+    stage.mission.handle(Pause(Cause("operator")))
+    assert stage.mission.handle(Abort(Cause("operator"))) is None
     assert play(stage).result().outcome == "aborted, at base"
 
 
@@ -80,7 +80,7 @@ def test_stop_ends_it_where_it_is_and_then_it_takes_no_commands(stage: BeaconSil
     assert stage.mission.state.mode is DONE
     assert stage.result().outcome == "stopped"
     over = "the mission is over"
-    for event in (Pause(""), Abort(""), StopHere()):
+    for event in (Pause(Cause("")), Abort(Cause("")), StopHere()):
         assert stage.mission.handle(event) == over
 
 
@@ -95,11 +95,11 @@ def test_what_holds_the_robot_says_when_it_continues() -> None:
     state = HoldState(VISITING)
     assert RULES.handle(state, Resume())[1] == "the mission is not held but visiting"
     state = after(state, DENIED, goes_on=False)
-    assert RULES.handle(state, Resume())[1] == "the cause persists: no radio"
+    assert RULES.handle(state, Resume())[1] == "the cause persists: no beacon is received"
     state = after(state, FREE, goes_on=True)
     state = after(replace(state, mode=VISITING), None, goes_on=False)
-    assert state.cause == "no fresh verdict from the danger loop"
-    state, _ = RULES.handle(after(state, FREE, goes_on=True), Fault("lost"))
+    assert text_of(state.cause) == "no fresh verdict from the danger loop"
+    state, _ = RULES.handle(after(state, FREE, goes_on=True), Fault(Cause("lost")))
     assert state.is_faulted
     state = after(state, FREE, goes_on=False)  # a fault waits for an operator
     state, refusal = RULES.handle(state, Resume())
@@ -107,8 +107,8 @@ def test_what_holds_the_robot_says_when_it_continues() -> None:
     after(state, FREE, goes_on=True)
 
 
-NO_FORWARD = Verdict(0, 0.0, EventCode.NEAR_EDGE, "", "", 0.0, 0.0, False, True, True)
-NOTHING = Verdict(0, 0.0, EventCode.NEAR_EDGE, "", "", 0.0, 0.0, False, False, False)
+NO_FORWARD = Verdict(0, 0.0, EventCode.NEAR_EDGE, NO_CAUSE, "", 0.0, 0.0, False, True, True)
+NOTHING = Verdict(0, 0.0, EventCode.NEAR_EDGE, NO_CAUSE, "", 0.0, 0.0, False, False, False)
 
 
 @pytest.fixture
@@ -324,7 +324,7 @@ def test_silence_of_all_radios_holds_the_robot_until_they_are_received_again() -
 @pytest.mark.parametrize(
     ("keys", "cause"),
     [
-        ({"sim__incidents": [{**SILENCE, "for_s": 1e4}]}, "no beacon is received for 30 s"),
+        ({"sim__incidents": [{**SILENCE, "for_s": 1e4}]}, "no beacon is received, for 30 s"),
         (
             {"mission__time_limit_s": 60.0, "sim__incidents": [{**THING, "for_s": 1e4}]},
             "the mission takes longer than mission.time_limit_s",
@@ -334,7 +334,7 @@ def test_silence_of_all_radios_holds_the_robot_until_they_are_received_again() -
 def test_what_lasts_needs_an_operator(keys: dict[str, Any], cause: str) -> None:
     stage = play(BeaconSilWorld(radio_config_of("zigbee", mission__laps=1, **keys)))
     assert stage.mission.state.is_faulted
-    assert stage.mission.state.cause.startswith(cause)
+    assert text_of(stage.mission.state.cause).startswith(cause)
     assert (stage.found.verdicts[-1].severity is Severity.FAULT) == ("received" in cause)
     assert not (stage.result().summary["obstacles"] or {}).get("touched")
 
@@ -401,7 +401,7 @@ def test_a_pose_too_uncertain_holds_until_readings_help() -> None:
     cfg = radio_config_of("zigbee", start__position_sigma_m=0.6, danger__hold_limit_s=600.0)
     stage = play(BeaconSilWorld(cfg), until_s=10.0)
     assert stage.mission.state.mode == "held"
-    assert stage.mission.state.cause == "the position is too uncertain"
+    assert text_of(stage.mission.state.cause) == "the position is too uncertain"
 
 
 def test_silent_encoders_hold_a_robot_among_beacons(cfg: RadioConfig) -> None:
@@ -418,7 +418,7 @@ def test_silent_encoders_hold_a_robot_among_beacons(cfg: RadioConfig) -> None:
         )
         verdicts.append((sensors.t, rules.step(sensors, extras, estimate)))
     for t_s, verdict in verdicts:
-        assert (verdict.cause == ENCODERS_STALE.message) is (t_s > 1.0 + limit_s + 1e-9), t_s
+        assert (text_of(verdict.cause) == ENCODERS_STALE.message) is (t_s > 1.0 + limit_s + 1e-9), t_s
     last = verdicts[-1][1]
     assert (last.forward, last.reverse, last.turn) == (False, False, False)
 

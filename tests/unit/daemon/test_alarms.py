@@ -13,25 +13,29 @@ from uuid import UUID
 import msgspec
 import pytest
 import structlog
+from msgspec.structs import replace
 from structlog.testing import capture_logs
 
 from ccatp import conditions
+from ccatp.conditions import text_of
 from ccatp.config.models import AlarmsConfig
-from ccatp.core import Severity
+from ccatp.core import Cause, EmergencyKind, Severity
 from ccatp.daemon import alarms, webhook
 from ccatp.daemon.alarms import LEAST_S, ActiveCause, AlarmList, active_cause, read_history
 from ccatp.daemon.danger_loop import FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
 from ccatp.daemon.webhook import AlarmWebhook, changes
 from ccatp.links.topics import Alarm, MissionStatus
+from ccatp.safety.emergency_latch import cause_of
 from tests.support.daemon import configuration, running_daemon
 from tests.support.http_server import Posts, taking_posts
 from tests.support.runs import until
 from tests.support.scenario import config_of
 
-FAN = conditions.FAN_WEAK.text(side="left")
-RIM = conditions.RIM_AHEAD.message
-STALE = conditions.EDGE_STALE.message
-FIRE, QUAKE, WEATHER = (f"emergency: {kind}" for kind in ("fire", "earthquake", "weather"))
+FAN = conditions.FAN_WEAK.because(side="left")
+RIM = conditions.RIM_AHEAD.because()
+STALE = conditions.EDGE_STALE.because()
+FIRE, QUAKE, WEATHER = map(cause_of, (EmergencyKind.FIRE, EmergencyKind.EARTHQUAKE, EmergencyKind.WEATHER))
+SLOW = conditions.SENSOR_TOO_SLOW.because(sensor="edge sensors", rate="100", least="200")
 NONE = Severity.NONE
 
 
@@ -44,8 +48,8 @@ def make(run_dir: Path) -> AlarmList:
     return AlarmList(run_dir, structlog.get_logger(), now=iter(f"T{k}" for k in range(1000)).__next__)
 
 
-def update(known: AlarmList, causes: list[tuple[str, Severity]], t_s: float) -> None:
-    """By their texts; a severity that is none is that of the row."""
+def update(known: AlarmList, causes: list[tuple[Cause, Severity]], t_s: float) -> None:
+    """A severity that is none is that of the row."""
     found = [(active_cause(cause), severity) for cause, severity in causes]
     known.update([one._replace(severity=severity or one.severity) for one, severity in found], t_s)
 
@@ -58,19 +62,19 @@ def shown(known: AlarmList) -> list[tuple[str, str]]:
     ("causes", "listed"),
     [
         ([], []),
-        ([("operator", NONE)], []),
-        ([(conditions.SENSOR_TOO_SLOW.text(sensor="edge sensors", rate=100, least=200), Severity.SLOW)], []),
+        ([(conditions.OPERATOR.because(), NONE)], []),
+        ([(SLOW, Severity.SLOW)], []),
         ([(FAN, NONE)], [("fan_weak", "return")]),
         ([(STALE, Severity.PAUSE)], []),
-        ([(f"{STALE}, for 30 s", Severity.FAULT)], [("edge_stale", "fault")]),
+        ([(replace(STALE, lasted_s=30.0), Severity.FAULT)], [("edge_stale", "fault")]),
         ([(STALE, Severity.HOLD), (FAN, NONE), (QUAKE, NONE)],
          [("earthquake", "fault"), ("fan_weak", "return"), ("edge_stale", "hold")]),
-        ([("what no row says", NONE)], [("other", "fault")]),
+        ([(Cause("of_a_newer_version"), NONE)], [("of_a_newer_version", "fault")]),
         ([(FAN, NONE), (FAN, Severity.FAULT)], [("fan_weak", "fault")]),
     ],
 )  # fmt: skip
 def test_what_is_an_alarm_and_how_grave(
-    known: AlarmList, causes: list[tuple[str, Severity]], listed: list[tuple[str, str]]
+    known: AlarmList, causes: list[tuple[Cause, Severity]], listed: list[tuple[str, str]]
 ) -> None:
     update(known, causes, 10.0)
     assert shown(known) == listed
@@ -95,7 +99,7 @@ def test_what_is_not_grave_must_last(known: AlarmList, monkeypatch: pytest.Monke
 
 
 def test_danger_says_which_of_two_rows_of_one_message_it_is(known: AlarmList) -> None:
-    slow, text = conditions.SENSOR_TOO_SLOW, conditions.SENSOR_TOO_SLOW.text(sensor="edge", rate=100, least=200)
+    slow, text = conditions.SENSOR_TOO_SLOW, text_of(SLOW)
     for t_s in (10.0, 11.0):
         known.update([ActiveCause(slow.name, text, Severity.SLOW)], t_s)
     assert shown(known) == [("sensor_too_slow", "slow")]
@@ -106,7 +110,7 @@ def test_a_grave_alarm_stays_until_it_is_acknowledged(known: AlarmList) -> None:
     update(known, [], 20.0)
     assert shown(known) == [("emergency", "return ended")]
     (alarm,) = known.alarms
-    assert (alarm.cause, alarm.advice) == (f"{FIRE}; {WEATHER}", conditions.EMERGENCY.advice)
+    assert (alarm.cause, alarm.advice) == ("emergency: fire; emergency: weather", conditions.EMERGENCY.advice)
     assert (alarm.since, alarm.since_s, alarm.count, alarm.ended) == ("T0", 10.0, 1, "T1")
     update(known, [(FIRE, NONE)], 30.0)
     assert known.alarms[0].count == 2
@@ -124,7 +128,7 @@ def test_a_grave_alarm_stays_until_it_is_acknowledged(known: AlarmList) -> None:
 def test_one_that_becomes_graver_is_to_be_acknowledged_again(known: AlarmList) -> None:
     update(known, [(STALE, Severity.HOLD)], 10.0)
     known.acknowledge("edge_stale", "anna", 11.0)
-    update(known, [(f"{STALE}, for 30 s", Severity.FAULT)], 40.0)
+    update(known, [(replace(STALE, lasted_s=30.0), Severity.FAULT)], 40.0)
     (alarm,) = known.alarms
     assert (alarm.severity, alarm.acknowledged_by, alarm.since_s, alarm.count) == ("fault", "", 10.0, 1)
     update(known, [(STALE, Severity.HOLD)], 41.0)
@@ -164,7 +168,7 @@ async def test_all_that_danger_finds_is_listed_not_only_the_gravest() -> None:
         daemon.danger.monitor.emergency("fire", str(uuid.uuid4()))  # which does not change the verdict
         await daemon.until(lambda: len(daemon.main.status().alarms) == 2)
         assert [(one.name, one.cause) for one in daemon.main.status().alarms] == [
-            ("earthquake", QUAKE), ("emergency", FIRE),
+            ("earthquake", text_of(QUAKE)), ("emergency", text_of(FIRE)),
         ]  # fmt: skip
 
 

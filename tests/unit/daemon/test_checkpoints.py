@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from ccatp.conditions import EARTHQUAKE, text_of
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EventCode, Fix, PointId, Severity, Verdict
+from ccatp.core import Cause, DeckPose, EventCode, Fix, PointId, Severity, Verdict
 from ccatp.daemon.checkpoints import StoreUnusable, build_parts
 from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.daemon.run_dir import keep_origin
@@ -112,7 +113,7 @@ def test_a_store_is_not_overwritten_and_a_resumed_plan_leaves_out_what_is_measur
 # -- taken over --------------------------------------------------------------------------------------------------------
 
 QUAKE = structs.replace(
-    FREE, code=EventCode.ABORTED, cause="emergency: earthquake", forward=False, reverse=False, turn=False, raised=1,
+    FREE, code=EventCode.ABORTED, cause=EARTHQUAKE.because(), forward=False, reverse=False, turn=False, raised=1,
     is_shaking=True,
 )  # fmt: skip
 FIX = Fix(1.0, (0.0, 0.0, 0.0), tuple(np.eye(3).ravel().tolist()), 1.0, (1, 2, 3, 4), 0.0)
@@ -131,13 +132,13 @@ def taken_over(story: Story, **event: Any) -> SurveyState:
     survey, state = story.mission.survey, story.mission.state
     after, _ = survey.handle(state, TakenOver(**{"measured": state.done, "skipped": state.skipped, **event}))
     assert after.fix is FixNeed.RELOCALIZE
-    assert (after.behaviour, after.corrected, after.interlock, after.severity) == (None, None, "", Severity.NONE)
+    assert (after.behaviour, after.corrected, after.interlock, after.severity) == (None, None, False, Severity.NONE)
     return after
 
 
 def in_force(state: SurveyState) -> tuple[str, str]:
     """Cause of an abort, and of a hold that an operator has to end."""
-    return state.abort_cause, state.cause if state.is_held_by_hand else ""
+    return text_of(state.abort_cause), text_of(state.cause) if state.is_held_by_hand else ""
 
 
 @pytest.mark.parametrize("is_new_run", [False, True])
@@ -145,10 +146,10 @@ def test_a_pause_and_an_abort(driving: Story, is_new_run: bool) -> None:
     mission = driving.mission
     assert in_force(taken_over(driving, is_new_run=is_new_run)) == ("", "")
     driving.frame(ABORT)
-    assert in_force(taken_over(driving, is_new_run=is_new_run)) == ("fire", "")
-    assert mission.handle(Pause("operator")) is None
+    assert in_force(taken_over(driving, is_new_run=is_new_run)) == ("emergency: fire", "")
+    assert mission.handle(Pause(Cause("operator"))) is None
     after = taken_over(driving, is_new_run=is_new_run)
-    assert (in_force(after), after.emergency_epoch) == (("fire", "operator"), 1)  # that emergency is not new
+    assert (in_force(after), after.emergency_epoch) == (("emergency: fire", "operator"), 1)  # that emergency is not new
 
 
 @pytest.mark.fault("O1")
@@ -164,7 +165,7 @@ def test_an_earthquake_is_kept_by_the_danger_loop(driving: Story) -> None:
 
 
 def test_what_was_stopped_on_its_way_home_goes_home_when_it_continues(driving: Story) -> None:
-    assert driving.mission.handle(Abort("operator")) is None
+    assert driving.mission.handle(Abort(Cause("operator"))) is None
     assert driving.mission.handle(StopHere()) is None
     after = taken_over(driving, is_new_run=True)
     assert (in_force(after), after.mode) == (("operator", ""), MissionState.IDLE)
@@ -174,11 +175,11 @@ def test_what_is_at_base_has_nothing_in_force(driving: Story) -> None:
     driving.until_state(MissionState.DONE, ABORT)
     after = taken_over(driving, is_new_run=True)
     assert (in_force(after), after.emergency_epoch, after.outcome) == (("", ""), 0, SurveyOutcome.NONE)
-    assert in_force(taken_over(driving)) == ("fire", "")  # died there: it is not another survey
+    assert in_force(taken_over(driving)) == ("emergency: fire", "")  # died there: it is not another survey
 
 
 def test_a_fault_waits_for_an_operator_who_begins_again_instead(driving: Story) -> None:
-    driving.mission.handle(Fault("a wheel is blocked"))
+    driving.mission.handle(Fault(Cause("a wheel is blocked")))
     after = taken_over(driving)
     assert (in_force(after), after.is_faulted) == (("", "a wheel is blocked"), True)
     after = taken_over(driving, is_new_run=True)
@@ -273,7 +274,7 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     built.mission.state = structs.replace(
         built.mission.state, skipped=(two,), failure_causes={two: "no lengths", three: "no time for it"}
     )
-    assert built.mission.handle(Fault("a wheel is blocked")) is None
+    assert built.mission.handle(Fault(Cause("a wheel is blocked"))) is None
     writer = CheckpointWriter(tmp_path, built.localizer, built.mission, is_patient=True)
     writer.boot = 7
     assert writer.is_due(3)
@@ -284,7 +285,7 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     restarted, store = build(replace(where, is_restarted=True))
     store.close()
     state = restarted.mission.state
-    assert (state.mode, state.cause, state.is_faulted) == (MissionState.HELD, "a wheel is blocked", True)
+    assert (state.mode, text_of(state.cause), state.is_faulted) == (MissionState.HELD, "a wheel is blocked", True)
     assert (state.done, state.skipped, state.budget.before_s) == ((one,), (two,), 12.5)
     assert state.failure_causes == {two: "no lengths", three: "no time for it"}
     assert len({stop.point for stop in state.route.stops} - {None}) == 6
@@ -296,7 +297,7 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     resumed, store = build(replace(where, is_resuming=True, is_held=True))
     store.close()
     state = resumed.mission.state
-    assert (state.mode, state.cause, state.is_faulted) == (MissionState.HELD, "a wheel is blocked", False)
+    assert (state.mode, text_of(state.cause), state.is_faulted) == (MissionState.HELD, "a wheel is blocked", False)
     assert (state.done, state.skipped, state.failure_causes, state.budget.before_s) == ((one,), (), {}, 0.0)
     assert len({stop.point for stop in state.route.stops} - {None}) == 8
 
@@ -333,11 +334,11 @@ def test_the_checkpoint_is_due_ten_times_a_second_and_at_each_hold_or_abort(driv
     writer = CheckpointWriter(tmp_path, cast(Localizer, localizer), mission, is_patient=True)
     for seq in range(60):
         if seq == 15:
-            mission.handle(Abort("fire"))
+            mission.handle(Abort(Cause("fire")))
         if seq == 38:
-            mission.handle(Pause("operator"))
+            mission.handle(Pause(Cause("operator")))
         if seq == 42:
-            mission.handle(Fault("x"))
+            mission.handle(Fault(Cause("x")))
         if seq == 55:
             localizer.deck_pose = DeckPose(nan, 0.0, 0.0)
         if writer.is_due(seq):

@@ -13,7 +13,7 @@ from ccatp.beacons.mission import MODES
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EventCode, Fix, PanelId, PanelPose, PointId, Severity, Verdict
+from ccatp.core import Cause, DeckPose, EventCode, Fix, PanelId, PanelPose, PointId, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.topics import (
     Alarm,
@@ -164,10 +164,12 @@ def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: Surv
 
 def test_the_verdict_and_its_cause(view: SurveyView) -> None:
     verdict = Verdict(
-        seq=4, t_s=1.0, code=EventCode.NEAR_EDGE, cause="edge", signal="front_left", value=0.006, limit=0.005,
+        seq=4, t_s=1.0, code=EventCode.NEAR_EDGE, cause=Cause("no_seam"), signal="front_left", value=0.006, limit=0.005,
         forward=False, reverse=True, turn=False, off=(True, False, False, False), severity=Severity.NONE,
     )  # fmt: skip
-    more = {"text": "edge (front left): 0.006 (limit 0.005)", "is_stale": False}
+    text = "off the panel where the map has no seam"
+    more = {"cause": text, "condition": "no_seam", "is_stale": False}
+    more["text"] = f"{text} (front left): 0.006 (limit 0.005)"
     assert reported(view, verdict)["verdict"] == json.loads(msgspec.json.encode(verdict)) | more
     assert reported(view, now_s=2.5)["verdict"]["is_stale"]
     event = DangerEvent(
@@ -239,8 +241,9 @@ def test_when_the_mission_ends_at_its_pace(view: SurveyView) -> None:
 
 
 def test_a_hold_by_an_operator_is_distinguished_from_one_by_a_fault(view: SurveyView) -> None:
-    for cause, is_by_operator in (("operator", True), ("no way on: rim", False), ("", False)):
-        assert reported(view, mission(state="held", cause=cause))["mission"]["is_by_operator"] is is_by_operator
+    for condition, is_by_operator in (("operator", True), ("no_way_on", False), ("", False)):
+        status = mission(state="held", cause="operator", condition=condition)
+        assert reported(view, status)["mission"]["is_by_operator"] is is_by_operator
 
 
 def test_messages_and_emergencies_are_those_of_the_run_directory(tmp_path: Path) -> None:

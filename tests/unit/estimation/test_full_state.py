@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.conditions import text_of
 from ccatp.core import DeckPose, FloatArray, GravitySample, PanelPose, WheelSample
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
@@ -249,7 +250,7 @@ def test_a_speed_that_no_wheel_can_give_is_a_divergence() -> None:
         encoders = [s._replace(right_rad_s=rate, left_rad_s=rate) for s in frame.encoders]
         found.step(*frame._replace(encoders=encoders))
     assert found.is_frozen
-    assert "more than the wheels can do" in found.hold_cause
+    assert "more than the wheels can do" in text_of(found.hold_cause)
 
 
 # -- time stamps ------------------------------------------------------------------------------------------------------

@@ -7,10 +7,11 @@ from typing import Any
 
 import msgspec
 
+from ccatp.conditions import text_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config, load_config, load_radio_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, PanelId, PointId
+from ccatp.core import Cause, DeckPose, PanelId, PointId
 from ccatp.daemon.mission_runner import TimedFrame
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
@@ -130,7 +131,7 @@ class RecordingRun(MeasuredSurvey):
     def status(self, outcome: str = "", exit_status: int = -1) -> None:
         state = self.mission.state
         message = MissionStatus(
-            seq=self.seq, t_s=self.t_s, state=str(state.mode), cause=state.cause, done=len(state.done),
+            seq=self.seq, t_s=self.t_s, state=str(state.mode), cause=text_of(state.cause), done=len(state.done),
             total=self.parts.total_points, elapsed_s=self.t_s, outcome=outcome, exit_status=exit_status,
         )  # fmt: skip
         self.write("mission", message)
@@ -176,7 +177,7 @@ class RecordingRun(MeasuredSurvey):
             self.flush()
         if self.only is not None and len(self.mission.state.done) >= self.only:
             self.only = None
-            self.mission.handle(Abort("the observatory wants the robot home"))
+            self.mission.handle(Abort(Cause("the observatory wants the robot home")))
 
     def _note_fix(self, topic: str, message: FixMessage) -> None:
         super()._note_fix(topic, message)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from ccatp import conditions as rows
-from ccatp.conditions import ALONE, TABLE, Condition, Group, Motion, Owner, fault
+from ccatp.conditions import ALONE, TABLE, Condition, Group, Motion, Owner, fault, text_of
 from ccatp.core import EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
@@ -215,7 +215,7 @@ NAMES = [row.condition.name for row in ROWS]
 
 def is_found(verdict: Verdict, row: Row) -> bool:
     pattern = re.sub(r"\\{\w+\\}", ".+", re.escape(row.condition.message))
-    is_it = re.match(pattern, verdict.cause) is not None and row.cause in verdict.cause
+    is_it = re.match(pattern, text_of(verdict.cause)) is not None and row.cause in text_of(verdict.cause)
     return is_it and (not row.signal or verdict.signal == row.signal) and verdict.severity >= row.condition.severity
 
 
@@ -255,7 +255,7 @@ def times_s(condition: Condition) -> Any:
 
 def test_a_sensor_that_was_slow_from_the_beginning_is_found() -> None:
     seen = Scripted().run(2.0, always(edge=1, imu=1, enc=1))
-    assert (seen[-1].cause, seen[-1].severity, seen[-1].forward) == (SLOW_EDGES, Severity.SLOW, True)
+    assert (text_of(seen[-1].cause), seen[-1].severity, seen[-1].forward) == (SLOW_EDGES, Severity.SLOW, True)
 
 
 def test_a_sensor_that_is_silent_is_not_slow() -> None:
@@ -263,26 +263,26 @@ def test_a_sensor_that_is_silent_is_not_slow() -> None:
     seen = scripted.run(1.5)
     for begin_s in (2.0, 3.0, 4.0):
         seen += scripted.run(begin_s - 0.05, always(edge=0, enc=0, imu=0)) + scripted.run(begin_s + 0.5)
-    causes = {verdict.cause for verdict in seen}
+    causes = {text_of(verdict.cause) for verdict in seen}
     assert rows.ENCODERS_STALE.message in causes
     assert "deliver" not in "".join(causes)
 
 
 def test_no_edge_sample_from_the_beginning() -> None:
     seen = Scripted().run(1.0, always(edge=0))
-    assert {(verdict.cause, verdict.severity) for verdict in seen} == {("no edge samples", Severity.PAUSE)}
+    assert {(text_of(verdict.cause), verdict.severity) for verdict in seen} == {("no edge samples", Severity.PAUSE)}
 
 
 def test_no_frame_and_lines_that_are_none() -> None:
     scripted = Scripted()
     scripted.run(1.0)
     verdict = scripted.monitor.stale(100, 1.0)
-    assert (verdict.cause, verdict.severity, verdict.forward) == (rows.NO_FRAME.message, Severity.PAUSE, False)
+    assert (text_of(verdict.cause), verdict.severity, verdict.forward) == (rows.NO_FRAME.message, Severity.PAUSE, False)
     found = [scripted.monitor.garbled(100, 1.0, 1.0 + 0.01 * k) for k in range(3)]
     assert found[:2] == [None, None]
     assert found[2] is not None
-    assert (found[2].cause, found[2].severity) == (rows.LINES_GARBLED.message, Severity.HOLD)
-    assert {verdict.cause for verdict in scripted.run(2.5)} == {rows.LINES_GARBLED.message}
+    assert (text_of(found[2].cause), found[2].severity) == (rows.LINES_GARBLED.message, Severity.HOLD)
+    assert {text_of(verdict.cause) for verdict in scripted.run(2.5)} == {rows.LINES_GARBLED.message}
     assert scripted.run(4.0)[-1].severity is Severity.NONE
 
 
@@ -295,7 +295,7 @@ def test_a_sensor_that_stays_off_is_left_behind_with_the_edge() -> None:
         return {"off": (0,), "rates": (rate, rate), "commanded": (-SPEED_RAD_S, SPEED_RAD_S) * 2}
 
     seen = scripted.run(BEGIN_S + 1.5, there_and_back)
-    causes = list(dict.fromkeys(verdict.cause for verdict in seen if verdict.code is EventCode.NEAR_EDGE))
+    causes = list(dict.fromkeys(text_of(verdict.cause) for verdict in seen if verdict.code is EventCode.NEAR_EDGE))
     assert causes == [rows.NO_SEAM.message, rows.EDGE_SENSOR_STAYS_OFF.message]
     assert (seen[-1].severity, seen[-1].signal) == (Severity.HOLD, "front_left")
 
@@ -351,4 +351,4 @@ def test_what_the_gyroscope_shows_at_rest_is_no_turn_afterwards() -> None:
     robot = Scripted()
     biased = always(wz_rad_s=0.25)
     seen = robot.run(4.0, biased)[10:] + robot.run(8.0, biased, drives)  # the first frames have no estimate
-    assert {verdict.cause for verdict in seen} == {""}
+    assert {text_of(verdict.cause) for verdict in seen} == {""}

@@ -6,7 +6,7 @@ from math import inf, nan
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import EDGE_STALE, ENCODERS_STALE, SAMPLES_MISDATED
+from ccatp.conditions import EDGE_STALE, ENCODERS_STALE, SAMPLES_MISDATED, Condition, text_of
 from ccatp.core import EdgeSample, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
@@ -59,13 +59,13 @@ def frames(wrong: str, offset_s: float | None, from_s: float = 1.0) -> Iterator[
 
 @pytest.mark.parametrize("offset_s", [-5.0, -1.02, 0.02, 0.4, 5.0])
 @pytest.mark.parametrize(("kind", "row"), [("enc", ENCODERS_STALE), ("edge", EDGE_STALE)])
-def test_a_sensor_whose_samples_have_impossible_times_is_silent(kind: str, row: object, offset_s: float) -> None:
+def test_a_sensor_whose_samples_have_impossible_times_is_silent(kind: str, row: Condition, offset_s: float) -> None:
     verdicts = list(frames(kind, offset_s))
     silent = list(frames(kind, None))
     permits = [[(v.forward, v.reverse, v.turn) for v in one] for one in (verdicts, silent)]
     assert permits[0] == permits[1]
     assert permits[0].index((False, False, False)) in (14, 15)  # the newest sample is then 0.15 s old
-    assert verdicts[-1].cause == getattr(row, "message")  # noqa: B009 - rows have many fields; this one is the text
+    assert verdicts[-1].cause == row.because()
     assert all(verdict.raised for verdict in verdicts)
     assert verdicts[0].severity is Severity.INFORM
 
@@ -75,5 +75,5 @@ def test_inertial_samples_of_impossible_times_are_reported_and_not_used(offset_s
     verdicts = list(frames("imu", offset_s))
     assert all(verdict.raised for verdict in verdicts)
     way = "older than" if offset_s < 0.0 else "later than"
-    assert verdicts[0].cause == f"samples of the accelerometer and gyroscope are {way} their frame: not used"
+    assert text_of(verdicts[0].cause) == f"samples of the accelerometer and gyroscope are {way} their frame: not used"
     assert verdicts[0].value == pytest.approx(abs(offset_s), abs=0.01)

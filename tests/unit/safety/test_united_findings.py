@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from ccatp.conditions import Condition, MonitorFinding
 from ccatp.config.models import Config
-from ccatp.core import EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
+from ccatp.core import NO_CAUSE, Cause, EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
@@ -20,16 +20,16 @@ from tests.support.rows import DANGER
 from tests.support.scenario import world_of
 
 CODES = {
-    "normal": Verdict(7, 0.07, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True),
-    "at an edge": Verdict(7, 0.07, EventCode.NEAR_EDGE, "rim", "front_left", 0.1, 0.0, False, True, False),
+    "normal": Verdict(7, 0.07, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True),
+    "at an edge": Verdict(7, 0.07, EventCode.NEAR_EDGE, Cause("rim_ahead"), "front_left", 0.1, 0.0, False, True, False),
     "an emergency": Verdict(
-        7, 0.07, EventCode.ABORTED, "emergency: fire", "emergency:fire", 1.0, 0.0, True, True, True
+        7, 0.07, EventCode.ABORTED, Cause("emergency", {"kind": "fire"}), "emergency:fire", 1.0, 0.0, True, True, True
     ),
 }
 
 
 def found(row: Condition) -> MonitorFinding:
-    return MonitorFinding(row, row.severity, row.name, row.name, 2.0, 1.0, row.full_fans)
+    return MonitorFinding(row, row.severity, row.because(), row.name, 2.0, 1.0, row.full_fans)
 
 
 def denied(verdict: Verdict) -> tuple[bool, bool, bool]:

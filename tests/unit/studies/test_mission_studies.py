@@ -12,6 +12,7 @@ import pytest
 from ccatp.cli import main
 from ccatp.config import load as loaders
 from ccatp.config.load import load_config
+from ccatp.core import Cause
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records import run_reader, summary
 from ccatp.sim.world import TruthRow
@@ -312,7 +313,7 @@ class MeasuredRun(SilRun):
         super()._note_truth()
         self._frames += 1
         if self._frames == 1000 and self._is_paused:
-            self.mission.handle(Pause("operator"))
+            self.mission.handle(Pause(Cause("operator")))
         if self._frames in (WARM_UP_FRAMES, WARM_UP_FRAMES + COMPARED_FRAMES):
             gc.collect()
             left = tracemalloc.take_snapshot().filter_traces(TRACK)

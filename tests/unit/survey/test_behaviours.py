@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import BEYOND_SEAM, NO_SEAM, RIM_AHEAD
+from ccatp.conditions import BEYOND_SEAM, NO_SEAM, RIM_AHEAD, Condition
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker
-from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Verdict, difference
+from ccatp.core import Cause, DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Verdict, difference
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.studies.sil_run import SilRun
@@ -230,11 +230,11 @@ def off_at(pose: Pose) -> Four:
     return a, b, rear_a, rear_b
 
 
-def verdict_of(off: Four, *, may_turn: bool, cause: str = RIM_AHEAD.message) -> Verdict:
+def verdict_of(off: Four, *, may_turn: bool, row: Condition = RIM_AHEAD) -> Verdict:
     code = EventCode.NEAR_EDGE if any(off) else EventCode.NORMAL
     is_free = not any(off)
     forward, reverse = not (off[0] or off[1]), not (off[2] or off[3])
-    return Verdict(0, 0.0, code, cause, "", 0.0, 0.0, forward, reverse, may_turn or is_free, off)
+    return Verdict(0, 0.0, code, row.because(), "", 0.0, 0.0, forward, reverse, may_turn or is_free, off)
 
 
 def deck_of(pose: PanelPose) -> DeckPose:
@@ -242,7 +242,7 @@ def deck_of(pose: PanelPose) -> DeckPose:
 
 
 def retreated(
-    pose: Pose, *, may_turn: bool, blames: Four | None = None, cause: str = RIM_AHEAD.message
+    pose: Pose, *, may_turn: bool, blames: Four | None = None, row: Condition = RIM_AHEAD
 ) -> tuple[Pose, list[RetreatStep]]:
     """Where a retreat ends that begins with the sensors that are off there, or ``blames``; wheels follow at once."""
     tracker = LegTracker(CFG.control, CFG.limits, 0.0)
@@ -253,7 +253,7 @@ def retreated(
         if retreat.step in (RetreatStep.OVER, RetreatStep.STUCK):
             break
         motion = StateEstimate(k * FRAME_S, FRAME_S, PanelPose(PANEL, *pose), deck_of, 0.0, rate_rad_s)
-        verdict = verdict_of(off_at(pose), may_turn=may_turn, cause=cause)
+        verdict = verdict_of(off_at(pose), may_turn=may_turn, row=row)
         retreat, twist = retreat.update(CFG.mission, tracker, motion, verdict, is_slow=False)
         rate_rad_s = twist.omega_rad_s
         x, y, heading = pose
@@ -287,9 +287,9 @@ def test_a_turn_away_that_sweeps_a_corner_over_the_rim_is_undone() -> None:
     assert 0.0 < turned < CFG.mission.turn_away_rad
 
 
-@pytest.mark.parametrize("cause", [NO_SEAM.message, BEYOND_SEAM.message])
-def test_off_what_may_be_a_seam_it_stands(cause: str) -> None:
-    _, seen = retreated((1.0, 0.1, 0.0), may_turn=True, blames=(True, False, False, False), cause=cause)
+@pytest.mark.parametrize("row", [NO_SEAM, BEYOND_SEAM], ids=lambda row: row.name)
+def test_off_what_may_be_a_seam_it_stands(row: Condition) -> None:
+    _, seen = retreated((1.0, 0.1, 0.0), may_turn=True, blames=(True, False, False, False), row=row)
     assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.OVER]
 
 
@@ -450,7 +450,7 @@ class Paused(SilRun):
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         super()._serve(frame, dt_s)
         if self.pause_s <= frame.t < self.pause_s + 0.005:
-            self.mission.handle(Pause("an operator"))
+            self.mission.handle(Pause(Cause("an operator")))
         elif self.pause_s + 1.0 <= frame.t < self.pause_s + 1.005:
             self.mission.handle(Resume())
 
