@@ -15,6 +15,8 @@ from typing import NamedTuple, ParamSpec
 
 from ccatp.core import Cause, EventCode, Severity, Verdict
 
+Permits = tuple[bool, bool, bool]  # forward, reverse, turn
+
 
 class Motion(Enum):
     """Motion that is still permitted."""
@@ -22,7 +24,14 @@ class Motion(Enum):
     ANY = "anything"
     RETREAT = "away from it"
     RETURN = "home"
+    ABORT = "home, because it is called"
     NONE = "nothing"
+
+    def permits(self, away: Permits = (True, True, True)) -> Permits:
+        """The permits of a verdict; ``away``: those of a retreat."""
+        if self is Motion.NONE:
+            return False, False, False
+        return away if self is Motion.RETREAT else (True, True, True)
 
 
 class Clear(Enum):
@@ -34,7 +43,7 @@ class Clear(Enum):
 
 
 class Action(Enum):
-    """Reactions to a condition, in the order of precedence."""
+    """Reactions to a condition."""
 
     EARTHQUAKE = "wheels held, then home"
     FAULT = "fault: held until an operator resumes"
@@ -42,6 +51,7 @@ class Action(Enum):
     HOLD = "hold: wheels held, a fix, then it continues by itself"
     SLOW = "half the speed"
     RETURN = "home"
+    ABORT = "home, because it is called"
     WAIT = "hold: wheels held until no sensor hangs over"
     RETREAT = "back off"
     PAUSE = "pause: wheels held, continues by itself"
@@ -49,9 +59,23 @@ class Action(Enum):
     INFORM = "reported"
 
 
+# Severity of the verdict; that of the other actions is NONE, because event code and permits express them.
+_SEVERITY = {
+    Action.FAULT: Severity.FAULT,
+    Action.RETURN: Severity.RETURN,
+    Action.LOCATE: Severity.HOLD,
+    Action.HOLD: Severity.HOLD,
+    Action.PAUSE: Severity.PAUSE,
+    Action.SLOW: Severity.SLOW,
+    Action.INFORM: Severity.INFORM,
+}
+_CODE = dict.fromkeys((Action.RETREAT, Action.WAIT, Action.KEEP_AWAY), EventCode.NEAR_EDGE) | dict.fromkeys(
+    (Action.EARTHQUAKE, Action.ABORT), EventCode.ABORTED
+)
+# Severity in the list of alarms of an action without one in the verdict.
 _ALARM_SEVERITY = {
     Action.EARTHQUAKE: Severity.FAULT,
-    Action.RETURN: Severity.RETURN,
+    Action.ABORT: Severity.RETURN,
     Action.WAIT: Severity.HOLD,
     Action.RETREAT: Severity.PAUSE,
     Action.KEEP_AWAY: Severity.INFORM,
@@ -94,8 +118,8 @@ class Condition:
 
     ``name``: the public name, of alarms and events. ``precedence``: of findings with equal severity the lowest number
     counts. ``message``: text of the cause, with "{...}" for variable parts;
-    ``meaning``: when it applies; ``advice``: what an operator can do. ``severity``: of the verdict; NONE if event code
-    and permits express it. ``limit``: key of the configuration with the time after which it has the severity
+    ``meaning``: when it applies; ``advice``: what an operator can do. ``clear``: what ends a pause, a hold or a fault
+    that the danger loop finds. ``limit``: key of the configuration with the time after which the action is
     ``escalates_to``. ``full_fans``: full fans meanwhile.
     ``retries``: how often it may repeat before it is a fault; ``None``: as configured.
     ``unit``: of the value against its limit. ``trusts_wheels``: what the wheels show in the hold is right.
@@ -109,15 +133,29 @@ class Condition:
     meaning: str
     advice: str
     action: Action
-    severity: Severity
     motion: Motion
-    clear: Clear
+    clear: Clear | None = None
     limit: str = ""
-    escalates_to: Severity = Severity.NONE
+    escalates_to: Action | None = None
     full_fans: bool = False
     retries: int | None = None
     unit: str = ""
     trusts_wheels: bool = False
+
+    @property
+    def severity(self) -> Severity:
+        """Severity of the verdict."""
+        return _SEVERITY.get(self.action, Severity.NONE)
+
+    @property
+    def code(self) -> EventCode:
+        """Event code of a verdict about it alone."""
+        return _CODE.get(self.action, EventCode.NORMAL)
+
+    @property
+    def raised_severity(self) -> Severity:
+        """Severity after ``limit``; NONE if it does not rise."""
+        return Severity.NONE if self.escalates_to is None else _SEVERITY[self.escalates_to]
 
     @property
     def alarm_severity(self) -> Severity:
@@ -152,9 +190,9 @@ class MonitorFinding(NamedTuple):
     full_fans: bool = False
 
     def verdict(self, seq: int, t_s: float, code: EventCode) -> Verdict:
-        """The verdict on frame ``seq``, which permits no motion."""
+        """The verdict on frame ``seq`` if nothing else is found."""
         shown = self.cause, self.signal, self.value, self.limit
-        return Verdict(seq, t_s, code, *shown, False, False, False, severity=self.severity)
+        return Verdict(seq, t_s, code, *shown, *self.condition.motion.permits(), severity=self.severity)
 
 
 TABLE: dict[str, Condition] = {}  # all registered rows by name
@@ -175,39 +213,28 @@ def registered(make: Callable[P, Condition]) -> Callable[P, Condition]:
 
 
 # Usual fields of a row by its action; a row may override them.
-_wait = partial(Condition, action=Action.PAUSE, severity=Severity.PAUSE, motion=Motion.NONE, clear=Clear.AUTO)
+_wait = partial(Condition, action=Action.PAUSE, motion=Motion.NONE, clear=Clear.AUTO)
 _beacon_hold = partial(
     Condition,
     action=Action.HOLD,
-    severity=Severity.HOLD,
     motion=Motion.NONE,
     clear=Clear.AUTO,
     limit="danger.hold_limit_s",
-    escalates_to=Severity.FAULT,
+    escalates_to=Action.FAULT,
 )
-inform = registered(
-    partial(Condition, action=Action.INFORM, severity=Severity.INFORM, motion=Motion.ANY, clear=Clear.AUTO)
-)
-slow = registered(partial(Condition, action=Action.SLOW, severity=Severity.SLOW, motion=Motion.ANY, clear=Clear.AUTO))
+inform = registered(partial(Condition, action=Action.INFORM, motion=Motion.ANY))
+slow = registered(partial(Condition, action=Action.SLOW, motion=Motion.ANY))
 wait = registered(_wait)
-pause = registered(partial(_wait, limit="health.pause_limit_s", escalates_to=Severity.HOLD))
+pause = registered(partial(_wait, limit="health.pause_limit_s", escalates_to=Action.HOLD))
 beacon_hold = registered(_beacon_hold)
 hold = registered(partial(_beacon_hold, clear=Clear.AFTER_FIX, limit="health.hold_limit_s"))
-go_home = registered(
-    partial(Condition, action=Action.RETURN, severity=Severity.RETURN, motion=Motion.RETURN, clear=Clear.OPERATOR)
-)
-fault = registered(
-    partial(Condition, action=Action.FAULT, severity=Severity.FAULT, motion=Motion.NONE, clear=Clear.OPERATOR)
-)
-shaken = registered(
-    partial(Condition, action=Action.EARTHQUAKE, severity=Severity.NONE, motion=Motion.NONE, clear=Clear.OPERATOR)
-)
-edge = registered(
-    partial(Condition, action=Action.RETREAT, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AFTER_FIX)
-)
-near = registered(
-    partial(Condition, action=Action.KEEP_AWAY, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AUTO)
-)
+# More than ``health.retries`` of them within ``health.retry_window_s`` are a fault.
+diverged = registered(partial(Condition, action=Action.HOLD, motion=Motion.NONE, clear=Clear.AFTER_FIX))
+go_home = registered(partial(Condition, action=Action.RETURN, motion=Motion.RETURN))
+fault = registered(partial(Condition, action=Action.FAULT, motion=Motion.NONE, clear=Clear.OPERATOR))
+shaken = registered(partial(Condition, action=Action.EARTHQUAKE, motion=Motion.NONE))
+edge = registered(partial(Condition, action=Action.RETREAT, motion=Motion.RETREAT))
+near = registered(partial(Condition, action=Action.KEEP_AWAY, motion=Motion.RETREAT))
 
 
 class SampleRate(NamedTuple):
@@ -326,10 +353,12 @@ LINES_GARBLED = hold("lines_garbled", Owner.DANGER, 250, Group.DATA, "lines of t
 # -- edge sensors and inertial unit -----------------------------------------------------------------------------------
 
 EDGE_SENSOR_CHATTERS = hold("edge_sensor_chatters", Owner.DANGER, 260, Group.SENSORS, "an edge sensor chatters",
-    "It changes many times a second where the map has no edge.", "Clean it; check its cable.", trusts_wheels=True)
+    "It changes many times a second where the map has no edge.", "Clean it; check its cable.", trusts_wheels=True,
+    action=Action.LOCATE)
 EDGE_SENSOR_FLASHES = pause("edge_sensor_flashes", Owner.DANGER, 270, Group.SENSORS,
     "an edge sensor went off though nothing moved",
-    "Light fell on it, or it fails.", "Nothing, unless it repeats. Stray light: cover the place.", trusts_wheels=True)
+    "Light fell on it, or it fails.", "Nothing, unless it repeats. Stray light: cover the place.", trusts_wheels=True,
+    escalates_to=Action.LOCATE)
 EDGE_SENSOR_STAYS_DARK = slow("edge_sensor_stays_dark", Owner.DANGER, 280, Group.SENSORS,
     "an edge sensor went off though nothing moved",
     "It stays off for longer than a pause may last: the edge rule decides, at half the speed.",
@@ -356,7 +385,8 @@ BATTERY_REPORTED = go_home("battery_reported", Owner.DANGER, 330, Group.FANS, "t
 # -- seams ------------------------------------------------------------------------------------------------------------
 
 EDGE_SENSOR_BLIND = hold("edge_sensor_blind", Owner.DANGER, 340, Group.SENSORS, "an edge sensor sees no seams: blind",
-    "It would not detect the rim either.", "Clean or replace it before `ccatp resume`.", retries=0, trusts_wheels=True)
+    "It would not detect the rim either.", "Clean or replace it before `ccatp resume`.", retries=0, trusts_wheels=True,
+    action=Action.LOCATE)
 SEAM_MISSED = slow("seam_missed", Owner.DANGER, 350, Group.SENSORS, "an edge sensor did not see a seam",
     "It crossed a seam without a signal. The robot continues at half its speed.",
     "Clean it; the second missed seam holds the robot.")
@@ -434,7 +464,7 @@ EARTHQUAKE = shaken("earthquake", Owner.DANGER, 560, Group.OBSERVATORY, "emergen
     "Clear it when its cause is gone and the robot is at base or held.")
 EMERGENCY = go_home("emergency", Owner.DANGER, 570, Group.OBSERVATORY, "emergency: {kind}",
     "Fire, power, weather or an operator's emergency: the robot goes home at once.",
-    "Clear it when its cause is gone and the robot is at base or held.", severity=Severity.NONE)
+    "Clear it when its cause is gone and the robot is at base or held.", action=Action.ABORT)
 
 # -- among beacons ----------------------------------------------------------------------------------------------------
 
@@ -494,11 +524,13 @@ LINK_LOST = wait("link_lost", Owner.LINK, ALONE, Group.LINK, "robot link lost: {
     "The connection ended. The robot holds its wheels by itself; main reconnects for `robot.reconnect_timeout_s`.",
     "Check network and robot. After that time the run ends with status 5; `--resume` continues it.",
     clear=Clear.AFTER_FIX)
-FRAMES_BACKWARD = hold("frames_backward", Owner.LOCALIZER, ALONE, Group.LINK, "time stamps of the frames run backward",
-    "Five in a row. The robot is held.", "Check the clock of the firmware.", limit='health.retries')
-SENSOR_BACKWARD = hold("sensor_backward", Owner.LOCALIZER, ALONE, Group.LINK,
+FRAMES_BACKWARD = diverged("frames_backward", Owner.LOCALIZER, ALONE, Group.LINK,
+    "time stamps of the frames run backward",
+    "Five in a row. The robot is held; repeated more than `health.retries` times, it is a fault.",
+    "Check the clock of the firmware.")
+SENSOR_BACKWARD = diverged("sensor_backward", Owner.LOCALIZER, ALONE, Group.LINK,
     "time stamps of the {sensor} run backward",
-    "The same for one sensor.", "Check the clock of the firmware.", limit='health.retries')
+    "The same for one sensor, likewise a fault if it repeats.", "Check the clock of the firmware.")
 
 LEG_OVERDUE = fault("leg_overdue", Owner.MISSION, ALONE, Group.SURVEY,
     "the leg to ({x_m:.3f}, {y_m:.3f}) m is overdue: is a wheel blocked or slipping?",
@@ -541,9 +573,9 @@ METROLOGY_UNRELIABLE = inform("metrology_unreliable", Owner.FIXES, ALONE, Group.
 LENGTHS_REFUSED = fault("lengths_refused", Owner.FIXES, ALONE, Group.SURVEY,
     "the laser system's lengths do not lead to the robot's base: {why}",
     "The lengths of the first fix give no position.", "Check the configured collimators and base.")
-FILTER_DIVERGED = hold("filter_diverged", Owner.LOCALIZER, ALONE, Group.SURVEY, "filter: {why}",
-    "The estimate is not a valid Gaussian any more. The pose is frozen until the next fix.",
-    "If it repeats, keep the run directory.", limit='health.retries')
+FILTER_DIVERGED = diverged("filter_diverged", Owner.LOCALIZER, ALONE, Group.SURVEY, "filter: {why}",
+    "The estimate is not a valid Gaussian any more. The pose is frozen until the next fix; a fault if it repeats.",
+    "If it repeats, keep the run directory.")
 
 FRAMES_MISSED = fault("frames_missed", Owner.MISSION, ALONE, Group.BEACONS,
     "no frames while the robot moved: put it at its start and start a new mission",
@@ -571,8 +603,7 @@ RESTARTED = fault("restarted", Owner.OPERATOR, ALONE, Group.OBSERVATORY,
     "A run was started again and waits for an operator.", "`ccatp resume` continues it.")
 OPERATOR = go_home("operator", Owner.OPERATOR, ALONE, Group.OBSERVATORY, "operator",
     "An operator called the robot home, or paused it: then it is held.",
-    "`ccatp resume` after a pause; otherwise nothing, a new survey measures the remaining points.",
-    severity=Severity.NONE)
+    "`ccatp resume` after a pause; otherwise nothing, a new survey measures the remaining points.", action=Action.ABORT)
 # fmt: on
 
 

@@ -249,8 +249,9 @@ class DangerMonitor(EmergencyRules):
     def _arbitrate(self, seq: int, t_s: float, findings: Sequence[MonitorFinding]) -> Verdict:
         missing = gravest(findings)
         if self._edges.is_lifted:
-            shown = conditions.ALL_OFF.because(), "edge", 4.0, 3.0
-            return Verdict(seq, t_s, EventCode.NEAR_EDGE, *shown, False, False, False, EVERYWHERE)
+            row = conditions.ALL_OFF
+            shown = row.because(), "edge", 4.0, 3.0
+            return Verdict(seq, t_s, row.code, *shown, *row.motion.permits(), EVERYWHERE)
         declared = self._declared()
         if declared is not None or self._origin.direction:
             return self._edge_verdict(seq, t_s, declared, missing)
@@ -266,14 +267,14 @@ class DangerMonitor(EmergencyRules):
         if declared is not None:
             a, b, c, d = (e is not None and e.phase is EdgePhase.DECLARED for e in self._edges.episodes)
             off, turn = (a, b, c, d), not barred and all(e is None or e.permits_turn for e in self._edges.episodes)
-            cause, signal = declared.cause.because(), CORNERS[off.index(True)].value
+            row, signal = declared.cause, CORNERS[off.index(True)].value
             value, limit = declared.value_m, declared.limit_m
         else:
             off, turn = (barred > 0, barred > 0, barred < 0, barred < 0), False
-            cause, signal = conditions.CENTRE_NEAR_RIM.because(), "estimate"
+            row, signal = conditions.CENTRE_NEAR_RIM, "estimate"
             value, limit = origin.clearance_m, origin.limit_m
         forward, reverse = barred <= 0 and not (off[0] or off[1]), barred >= 0 and not (off[2] or off[3])
-        permits = (forward, reverse, turn)
+        cause, permits = row.because(), row.motion.permits((forward, reverse, turn))
         if missing is not None:
             cause, permits = msgspec.structs.replace(cause, besides=missing.cause), (False, False, False)
-        return Verdict(seq, t_s, EventCode.NEAR_EDGE, cause, signal, value, limit, *permits, off)
+        return Verdict(seq, t_s, row.code, cause, signal, value, limit, *permits, off)

@@ -33,7 +33,7 @@ from ccatp.survey.failsafe import (
     ON_NO_VERDICT,
     ON_UNKNOWN,
     is_denied,
-    pause,
+    stand,
 )
 from ccatp.survey.state import Hold, HoldRules, HoldState, Row
 
@@ -46,7 +46,7 @@ class BeaconRules(HoldRules[HoldState]):
 
     rows = (
         *(ON_EARTHQUAKE, ON_FAULT, ON_UNKNOWN, ON_HOLD, ON_NO_VERDICT),
-        Row("nothing is permitted", Action.PAUSE, lambda _, v: is_denied(v), pause),
+        Row("nothing is permitted", Action.PAUSE, lambda _, v: is_denied(v), stand),
         ON_EMERGENCY,
     )
 

@@ -258,7 +258,7 @@ class MainLoop(RobotLoop):
         mission = self._runner.mission
         state = mission.state
         row = self._own_pause_of(state)
-        waits = row is not None and row.escalates_to is not Severity.NONE and not state.is_held_by_hand
+        waits = row is not None and row.escalates_to is not None and not state.is_held_by_hand
         lasts_s = self._paused.lasts(now_s, waits and not self.is_lockstep)
         hold_s, fault_s = self._pause_limits_s
         self._has_gap = self._has_gap and lasts_s >= 0.0

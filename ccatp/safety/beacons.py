@@ -23,11 +23,12 @@ from ccatp.conditions import (
     MonitorFinding,
 )
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import NO_CAUSE, EventCode, Severity, Verdict, wrap_pi
+from ccatp.core import NO_CAUSE, EventCode, Verdict, wrap_pi
 from ccatp.links.beacon_messages import BeaconFrame
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.safety.emergency_latch import EmergencyRules
+from ccatp.safety.escalation import limit_s
 from ccatp.sensing.sample_times import LATEST_S, possible_samples
 
 
@@ -211,8 +212,9 @@ class BeaconSafetyRules(EmergencyRules):
         if self._held_since_s is None:
             self._held_since_s = sensors.t
         held_s = sensors.t - self._held_since_s
-        if held_s > self._danger.hold_limit_s:
-            hold = hold._replace(severity=Severity.FAULT, cause=replace(hold.cause, lasted_s=float(round(held_s))))
+        if held_s > limit_s(hold.condition, self._danger):
+            cause = replace(hold.cause, lasted_s=float(round(held_s)))
+            hold = hold._replace(severity=hold.condition.raised_severity, cause=cause)
         return hold.verdict(sensors.seq, sensors.t, code)
 
     @property
@@ -229,14 +231,14 @@ class BeaconSafetyRules(EmergencyRules):
         target_m = self._nearest_target_m()
         forward, reverse = ahead_m >= danger.obstacle_m and target_m >= danger.target_m, behind_m >= danger.obstacle_m
         if ahead_m < danger.obstacle_m:
-            found = OBSTACLE_AHEAD.because(), "obstacle", ahead_m, danger.obstacle_m
+            row, found = OBSTACLE_AHEAD, ("obstacle", ahead_m, danger.obstacle_m)
         elif target_m < danger.target_m:
-            found = TARGET_NEAR.because(), "target", target_m, danger.target_m
+            row, found = TARGET_NEAR, ("target", target_m, danger.target_m)
         elif behind_m < danger.obstacle_m:
-            found = OBSTACLE_BEHIND.because(), "obstacle", behind_m, danger.obstacle_m
+            row, found = OBSTACLE_BEHIND, ("obstacle", behind_m, danger.obstacle_m)
         else:
             return emergency or Verdict(seq, t_s, _NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
-        return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True)
+        return Verdict(seq, t_s, row.code, row.because(), *found, *row.motion.permits((forward, reverse, True)))
 
     def _nearest_target_m(self) -> float:
         """Lower bound of the target's distance: mean level minus one standard deviation; infinite without a level."""

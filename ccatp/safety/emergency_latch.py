@@ -80,9 +80,9 @@ class EmergencyLatch:
         if newest is None:
             return None
         # A robot that moves in an earthquake slips. From the other emergencies it drives home.
-        kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.is_shaking else (newest.kind, True)
-        cause, signal = cause_of(kind), f"emergency:{kind}"
-        return Verdict(seq, t_s, EventCode.ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
+        kind = EmergencyKind.EARTHQUAKE if self.is_shaking else newest.kind
+        row, cause, signal = EARTHQUAKE if self.is_shaking else EMERGENCY, cause_of(kind), f"emergency:{kind}"
+        return Verdict(seq, t_s, row.code, cause, signal, 1.0, 0.0, *row.motion.permits())
 
     def with_emergencies(self, verdict: Verdict) -> Verdict:
         """A verdict with the state of the latch added, because its code may come from another rule."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from ccatp.conditions import MonitorFinding
+from ccatp.conditions import Condition, MonitorFinding, Motion
 from ccatp.config.models import HealthConfig
 from ccatp.core import EventCode, Severity, Verdict
 
@@ -57,7 +57,9 @@ class Since:
         return t_s - self.t_s
 
 
-_DENYING = (Severity.PAUSE, Severity.HOLD, Severity.FAULT)
+def limit_s(row: Condition, section: object) -> float:
+    """The time after which a condition becomes more severe, from the section of the configuration that has it."""
+    return float(getattr(section, row.limit.partition(".")[2]))
 
 
 def gravest(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
@@ -66,8 +68,8 @@ def gravest(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
 
 
 def denies(findings: Iterable[MonitorFinding]) -> bool:
-    """Whether any finding holds the wheels. A RETURN, although more severe than a hold, does not."""
-    return any(finding.severity in _DENYING for finding in findings)
+    """Whether any finding holds the wheels. A return, although more severe than a hold, does not."""
+    return any(finding.condition.motion is Motion.NONE for finding in findings)
 
 
 def with_findings(verdict: Verdict, findings: Sequence[MonitorFinding]) -> Verdict:
@@ -95,8 +97,9 @@ def with_findings(verdict: Verdict, findings: Sequence[MonitorFinding]) -> Verdi
 class SeverityEscalation:
     """Raises the severity of findings that last or repeat.
 
-    A pause longer than ``pause_limit_s`` becomes a hold, so that a fix is taken before the mission continues. A hold
-    longer than its limit becomes a fault, because it does not end by itself. A hold for the same signal that repeats
+    A finding that lasts longer than the limit of its row gets the severity that the row states: a pause becomes a hold,
+    so that a fix is taken before the mission continues. A hold becomes a fault, because it does not end by itself; one
+    that was a pause does so after ``hold_limit_s``. A hold for the same signal that repeats
     more than ``retries`` times within ``retry_window_s`` becomes a fault, too.
     """
 
@@ -120,17 +123,17 @@ class SeverityEscalation:
         return [self._raised(t_s, finding) for finding in findings]
 
     def _raised(self, t_s: float, finding: MonitorFinding) -> MonitorFinding:
-        cfg, lasted_s = self._cfg, t_s - self._since_s[finding.signal]
-        if finding.severity is Severity.PAUSE:
-            if lasted_s < cfg.pause_limit_s:
-                return finding
-            finding = finding._replace(severity=Severity.HOLD)
-        if finding.severity is not Severity.HOLD:
+        row, lasted_s = finding.condition, t_s - self._since_s[finding.signal]
+        if row.escalates_to is None:
             return finding
-        patience_s = cfg.lifted_limit_s if finding.condition.limit == "health.lifted_limit_s" else cfg.hold_limit_s
+        patience_s = limit_s(row, self._cfg)
         if lasted_s >= patience_s:
-            return finding._replace(severity=Severity.FAULT, cause=replace(finding.cause, lasted_s=patience_s))
-        return self._count(t_s, finding, is_new=lasted_s == 0.0)
+            finding = finding._replace(severity=row.raised_severity)
+            if finding.severity is Severity.HOLD and lasted_s >= self._cfg.hold_limit_s:
+                patience_s, finding = self._cfg.hold_limit_s, finding._replace(severity=Severity.FAULT)
+        if finding.severity is Severity.FAULT:
+            return finding._replace(cause=replace(finding.cause, lasted_s=patience_s))
+        return self._count(t_s, finding, is_new=lasted_s == 0.0) if finding.severity is Severity.HOLD else finding
 
     def _count(self, t_s: float, finding: MonitorFinding, *, is_new: bool) -> MonitorFinding:
         cfg, held = self._cfg, self._held.setdefault(finding.signal, deque())

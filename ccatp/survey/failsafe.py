@@ -7,18 +7,9 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from ccatp.conditions import (
-    BACK_OFFS,
-    EARTHQUAKE,
-    EDGE_SENSOR_BLIND,
-    EDGE_SENSOR_CHATTERS,
-    EDGE_SENSOR_FLASHES,
-    EDGE_SENSOR_STAYS_OFF,
-    TABLE,
-    Action,
-    Condition,
-)
+from ccatp.conditions import BACK_OFFS, EARTHQUAKE, STUCK_AT_EDGE, TABLE, Action, Clear, Condition
 from ccatp.core import Severity, Verdict
+from ccatp.safety.escalation import limit_s
 from ccatp.survey.behaviours import Retreat, ReturnHome
 from ccatp.survey.events import BACKING_OFF, DONE, DRIVING, HELD, TURNING, MissionEvent
 from ccatp.survey.route_follower import StateEstimate
@@ -40,8 +31,8 @@ if TYPE_CHECKING:
     from ccatp.survey.statechart import Survey
 
 REDUCED = Severity.SLOW, RETURN
-# Faults of one edge sensor: a fix at rest shows whether it may be over a seam or the rim.
-OF_ONE_SENSOR = EDGE_SENSOR_CHATTERS, EDGE_SENSOR_FLASHES, EDGE_SENSOR_STAYS_OFF, EDGE_SENSOR_BLIND
+# What ends a reaction without motion whose severity was raised, or is that of another row.
+RAISED = {HOLD: Clear.AFTER_FIX, RETURN: Clear.AFTER_FIX, FAULT: Clear.OPERATOR}
 
 
 def is_denied(v: Verdict) -> bool:
@@ -52,6 +43,21 @@ def is_denied(v: Verdict) -> bool:
 def row_of(v: Verdict) -> Condition | None:
     """The row of a verdict's cause; ``None`` without a cause, or for one that is not known here."""
     return TABLE.get(v.cause.condition)
+
+
+def action_of(v: Verdict) -> Action | None:
+    """The action of the row of a verdict's cause, at the severity of the verdict."""
+    row = row_of(v)
+    if row is None or v.severity is row.severity:
+        return None if row is None else row.action
+    return row.escalates_to if v.severity is row.raised_severity else None
+
+
+def clear_of(v: Verdict) -> Clear:
+    """What ends the reaction to a verdict that permits no motion; without a row of its own, by the severity."""
+    row = row_of(v)
+    own = row.clear if row is not None and v.severity is row.severity else None
+    return own or RAISED.get(v.severity, Clear.AUTO)
 
 
 # -- rows of every mission --------------------------------------------------------------------------------------------
@@ -68,15 +74,20 @@ def _stand_in_earthquake(rules: HoldRules[S], s: S, _frame: object, v: Verdict) 
     return s, v.severity is not FAULT
 
 
-def _fault(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
-    if s.mode is HELD and s.is_faulted:
-        return s, True
-    return rules.fault(s, v.cause, loses_pose=True), True
+def stand(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
+    """No motion until what the row states: an operator, or the cause is gone, for a hold with a fix after it."""
+    clear = clear_of(v)
+    if clear is Clear.OPERATOR:
+        return s if s.mode is HELD and s.is_faulted else rules.fault(s, v.cause, loses_pose=True), True
+    if not is_denied(v) or (clear is Clear.AUTO and v.severity < HOLD):
+        return pause(rules, s, _frame, v)
+    return _hold(rules, s, _frame, v, relocalizes=clear is Clear.AFTER_FIX)
 
 
-def _hold(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
+def _hold(rules: HoldRules[S], s: S, _frame: object, v: Verdict, *, relocalizes: bool = True) -> tuple[S, bool]:
     row = row_of(v)
-    return rules.await_recovery(s, v.cause, rejects_odometry=row is None or not row.trusts_wheels), True
+    rejects_odometry = row is None or not row.trusts_wheels
+    return rules.await_recovery(s, v.cause, rejects_odometry=rejects_odometry, relocalizes=relocalizes), True
 
 
 def pause(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
@@ -98,12 +109,12 @@ ON_EARTHQUAKE = Row(
     lambda _, v: v.is_shaking and v.code is not NEAR_EDGE,
     _stand_in_earthquake,
 )
-ON_FAULT = Row("the severity is fault", Action.FAULT, lambda _, v: v.severity is FAULT, _fault)
+ON_FAULT = Row("the severity is fault", Action.FAULT, lambda _, v: v.severity is FAULT, stand)
 ON_HOLD = Row(
     "the severity is hold or above, and nothing is permitted",
     Action.HOLD,
     lambda _, v: v.severity >= HOLD and is_denied(v),
-    _hold,
+    stand,
 )
 ON_UNKNOWN = Row(
     "the cause is not known here: the danger loop is of another version",
@@ -155,7 +166,7 @@ def _wait_at_edge(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Ve
     is_over = s.mode is not HELD or s.hold.by_hand or (v.code is not NEAR_EDGE and v is not NO_FRESH_VERDICT)
     if s.stuck_s is None or is_over:
         return replace(s, stuck_s=None), False
-    if motion.t_s - s.stuck_s > survey.cfg.health.hold_limit_s:
+    if motion.t_s - s.stuck_s > limit_s(STUCK_AT_EDGE, survey.cfg.health):
         return survey.fault(replace(s, stuck_s=None), s.cause), True
     return s, True
 
@@ -192,7 +203,7 @@ ROWS = (
     Row(
         "the severity is hold for a fault of one edge sensor, and nothing is permitted",
         Action.LOCATE,
-        lambda _, v: v.severity is HOLD and row_of(v) in OF_ONE_SENSOR and is_denied(v),
+        lambda _, v: action_of(v) is Action.LOCATE and is_denied(v),
         _locate,
     ),
     ON_HOLD,
@@ -215,7 +226,7 @@ ROWS = (
         "some motion is not permitted",
         Action.PAUSE,
         lambda _, v: not (v.forward and v.reverse and v.turn),
-        pause,
+        stand,
     ),
     ON_EMERGENCY,
 )

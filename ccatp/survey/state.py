@@ -250,12 +250,13 @@ class HoldRules(Generic[S]):
         """Hold until an operator resumes, because of a fault. With ``loses_pose`` the robot relocalizes then."""
         return s if s.mode is DONE else self.hold(s, cause, by_hand=True, is_fault=True)
 
-    def await_recovery(self, s: S, cause: Cause, *, rejects_odometry: bool = False) -> S:
+    def await_recovery(self, s: S, cause: Cause, *, rejects_odometry: bool = False, relocalizes: bool = True) -> S:
         """Hold until the cause is gone, then relocalize before moving on."""
         if s.mode is DONE or s.is_held_by_hand:
             return s
         rejects_odometry |= s.rejects_odometry
-        s = self.lose_pose(replace(self.interrupt(s, cause), cause=cause), doubts_odometry=False)
+        s = replace(self.interrupt(s, cause), cause=cause)
+        s = self.lose_pose(s, doubts_odometry=False) if relocalizes else s
         return replace(s, hold=s.hold._replace(rejects_odometry=rejects_odometry))
 
     def abort(self, s: S, cause: Cause) -> S:

@@ -51,6 +51,16 @@ ABOUT = {
 }
 
 
+# What ends a reaction that its action describes completely.
+ENDS = dict.fromkeys((Action.RETURN, Action.ABORT, Action.EARTHQUAKE), "by an operator") | {
+    Action.INFORM: "by itself",
+    Action.SLOW: "by itself",
+    Action.KEEP_AWAY: "by itself",
+    Action.RETREAT: "after a fix",
+    Action.WAIT: "after a fix",
+}
+
+
 def table(head: str, rows: Iterable[Iterable[object]]) -> str:
     """A table of Markdown; ``head`` is its first line."""
     lines = [f"| {' | '.join(map(str, row))} |" for row in rows]
@@ -73,14 +83,14 @@ def shown(message: str) -> str:
 
 
 def _alarm(row: Condition) -> tuple[str, ...]:
-    limit = f"`{row.limit}`: {row.escalates_to.name.lower()}" if row.limit else ""
+    limit = f"`{row.limit}`: {row.raised_severity.name.lower()}" if row.limit else ""
     retries = "" if row.retries is None else f"; at the {('first', 'second')[row.retries]} return: fault"
     return (
         shown(row.message),
         row.owner.value,
         row.action.value,
         row.motion.value,
-        row.clear.value,
+        row.clear.value if row.clear is not None else ENDS[row.action],
         limit + retries,
         row.meaning,
         row.advice,

@@ -248,7 +248,7 @@ def test_it_is_found_lasts_and_is_over(row: Row) -> None:
 def times_s(condition: Condition) -> Any:
     """When the condition becomes graver, after its signal was found first."""
     times = {Severity.HOLD: 2.0} if condition.severity is Severity.PAUSE else {}
-    if condition.escalates_to is not Severity.NONE:
+    if condition.escalates_to is not None:
         times[Severity.FAULT] = 3.0 if condition is rows.LIFTED else LIMIT_S
     return pytest.approx(times, abs=0.025)  # two frames: the monitors look at every second one
 

@@ -1,0 +1,201 @@
+"""Each cell of the table of conditions acts: with another value the danger loop or the mission does something else."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from ccatp.conditions import TABLE, Action, Clear, Condition, Group, Motion
+from ccatp.config.models import Config
+from ccatp.core import NO_CAUSE, EmergencyKind, EventCode, Severity, Verdict
+from ccatp.daemon.alarms import active_cause
+from ccatp.mirror.mirror import Mirror
+from ccatp.safety import edge_detector, emergency_latch
+from ccatp.safety.emergency_latch import EmergencyLatch
+from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
+from ccatp.survey.events import MissionState
+from ccatp.survey.state import SurveyState
+from tests.support.mission_story import Story
+from tests.support.rows import DANGER, OTHERS
+from tests.support.scenario import config_of, mirror_of
+from tests.unit.test_danger import FRONT
+from tests.unit.test_danger import Story as EdgeStory
+
+FREE = Verdict(0, 0.0, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+LIMITS = {"health.pause_limit_s": 3.0, "health.hold_limit_s": 7.0, "health.lifted_limit_s": 5.0}
+HEALTH = config_of("fyst-m2", **{name.replace(".", "__"): value for name, value in LIMITS.items()}).health
+FOUND = [row for row in DANGER if row.severity and row.group is not Group.BEACONS]  # by a monitor
+
+
+def named(rows: Sequence[Condition]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("row", rows, ids=[row.name for row in rows])
+
+
+def verdict_of(row: Condition) -> Verdict:
+    return with_findings(FREE, [row.found("x", 2.0, 1.0)])
+
+
+def escalated(row: Condition, t_s: float) -> Verdict:
+    """The verdict on a condition that has lasted for ``t_s``."""
+    rules = SeverityEscalation(HEALTH)
+    rules.escalate(0.0, [row.found("x", 2.0, 1.0)])
+    return with_findings(FREE, rules.escalate(t_s, [row.found("x", 2.0, 1.0)]))
+
+
+def times_until_fault(row: Condition) -> int:
+    rules = SeverityEscalation(HEALTH)
+    for count in range(1, 10):
+        (found,) = rules.escalate(float(count), [row.found("x", 2.0, 1.0)])
+        if found.severity is Severity.FAULT:
+            return count
+        rules.escalate(count + 0.5, [])
+    return 10
+
+
+@named(FOUND)
+def test_action_gives_the_severity(row: Condition) -> None:
+    other = replace(row, action=Action.SLOW if row.action is not Action.SLOW else Action.RETURN)
+    assert verdict_of(row).severity is not verdict_of(other).severity
+    assert verdict_of(row).severity is row.severity
+
+
+@named([*DANGER, *OTHERS])
+def test_action_gives_the_colour_of_the_alarm(row: Condition, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = active_cause(row.because()).severity
+    other = replace(row, action=Action.SLOW if before is not Severity.SLOW else Action.FAULT)
+    monkeypatch.setitem(TABLE, row.name, other)
+    assert active_cause(row.because()).severity is not before
+
+
+@named(FOUND)
+def test_motion_gives_the_permits(row: Condition) -> None:
+    other = replace(row, motion=Motion.ANY if row.motion is Motion.NONE else Motion.NONE)
+    before, after = verdict_of(row), verdict_of(other)
+    assert (before.forward, before.reverse, before.turn) == ((row.motion is not Motion.NONE,) * 3)
+    assert (after.forward, after.reverse, after.turn) == ((row.motion is Motion.NONE,) * 3)
+
+
+@named(FOUND)
+def test_full_fans_are_those_of_the_row(row: Condition) -> None:
+    assert verdict_of(row).full_fans is row.full_fans
+    assert verdict_of(replace(row, full_fans=not row.full_fans)).full_fans is not row.full_fans
+
+
+@named(FOUND)
+def test_precedence_selects_the_cause_of_equal_severity(row: Condition) -> None:
+    other = replace(row, name="another", precedence=row.precedence + 1)
+    found = row.found("x", 2.0, 1.0), other.found("y", 2.0, 1.0)
+    assert gravest(found) is found[0]
+    assert gravest((found[0], replace(other, precedence=row.precedence - 1).found("y", 2.0, 1.0))) is not found[0]
+
+
+LASTING = [row for row in FOUND if row.limit]
+
+
+@named(LASTING)
+def test_limit_is_when_the_severity_rises(row: Condition) -> None:
+    for name, limit_s in LIMITS.items():
+        changed = replace(row, limit=name)
+        assert escalated(changed, limit_s - 0.1).severity is row.severity
+        assert escalated(changed, limit_s).severity > row.severity
+
+
+@named(LASTING)
+def test_escalates_to_is_what_it_becomes(row: Condition) -> None:
+    at_s = LIMITS[row.limit]
+    assert escalated(row, at_s).severity is row.raised_severity
+    assert escalated(replace(row, escalates_to=Action.RETURN), at_s).severity is Severity.RETURN
+    assert escalated(replace(row, escalates_to=None), 1e3).severity is row.severity
+
+
+@named([row for row in FOUND if row.severity is Severity.HOLD])
+def test_retries_is_how_often_a_hold_may_repeat(row: Condition) -> None:
+    expected = HEALTH.retries if row.retries is None else row.retries
+    assert times_until_fault(row) == expected + 2
+    assert times_until_fault(replace(row, retries=expected + 1)) == expected + 3
+
+
+def reacted(config: Config, mirror: Mirror, verdict: Verdict) -> SurveyState:
+    """The state of a driving survey after a verdict."""
+    story = Story(config, mirror)
+    story.until_state(MissionState.DRIVING)
+    story.frame(verdict)
+    return story.state
+
+
+def what_ends(state: SurveyState) -> tuple[bool, bool]:
+    """Whether an operator has to end the hold, and whether a fix comes before the next move."""
+    assert state.mode is MissionState.HELD
+    return state.is_held_by_hand, state.is_lost
+
+
+ENDS = {Clear.AUTO: (False, False), Clear.AFTER_FIX: (False, True), Clear.OPERATOR: (True, True)}
+
+
+@named([row for row in FOUND if row.clear is not None and row.action is not Action.LOCATE])
+def test_clear_is_what_ends_the_hold(row: Condition, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, mirror = config_of("fyst-m2"), mirror_of("fyst-m2")
+    for clear, ends in ENDS.items():
+        monkeypatch.setitem(TABLE, row.name, replace(row, clear=clear))
+        state = reacted(config, mirror, verdict_of(row))
+        assert what_ends(state) == ends, clear
+
+
+@named([row for row in FOUND if Action.LOCATE in (row.action, row.escalates_to)])
+def test_a_fault_of_one_edge_sensor_is_looked_at_with_a_fix(row: Condition, monkeypatch: pytest.MonkeyPatch) -> None:
+    verdict = verdict_of(row) if row.action is Action.LOCATE else escalated(row, LIMITS[row.limit])
+    assert verdict.severity is Severity.HOLD
+    config, mirror = config_of("fyst-m2"), mirror_of("fyst-m2")
+    assert reacted(config, mirror, verdict).has_looked
+    changed = replace(row, action=Action.HOLD if row.action is Action.LOCATE else row.action, escalates_to=Action.FAULT)
+    changed = replace(changed, escalates_to=Action.HOLD) if row.action is Action.PAUSE else changed
+    monkeypatch.setitem(TABLE, row.name, changed)
+    assert not reacted(config, mirror, verdict).has_looked
+
+
+@named([row for row in FOUND if row.clear is Clear.AFTER_FIX])
+def test_trusts_wheels_is_whether_odometry_is_used_in_the_hold(row: Condition, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, mirror = config_of("fyst-m2"), mirror_of("fyst-m2")
+    for trusts in (False, True):
+        monkeypatch.setitem(TABLE, row.name, replace(row, action=Action.HOLD, trusts_wheels=trusts))
+        assert reacted(config, mirror, verdict_of(row)).rejects_odometry is not trusts
+
+
+# -- edges, emergencies, and what is near a robot among beacons --------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["RIM_AHEAD", "BEYOND_SEAM", "NO_SEAM", "OFF_WITHOUT_WHEELS"])
+def test_motion_and_action_of_an_edge_give_permits_and_code(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    row: Condition = getattr(edge_detector, name)
+    cfg, mirror = config_of("fyst-m1"), mirror_of("fyst-m1")
+    right = max(mirror.panels.values(), key=lambda panel: (panel.x_m, -abs(panel.y_m)))
+
+    def verdict(**cells: Any) -> Verdict:
+        monkeypatch.setattr(edge_detector, "RIM_AHEAD", replace(row, **cells))
+        story = EdgeStory(cfg, mirror, (right.x_m + right.half_x_m - 0.091, right.y_m, 0.0))
+        return [story.frame(0.1), story.frame(0.1, off=FRONT)][-1]
+
+    assert verdict().code is EventCode.NEAR_EDGE
+    assert (verdict().forward, verdict().reverse) == (False, True)
+    assert not verdict(motion=Motion.NONE).reverse
+    assert verdict(motion=Motion.ANY).forward
+    assert verdict(action=Action.ABORT).code is EventCode.ABORTED
+
+
+@pytest.mark.parametrize("kind", [EmergencyKind.FIRE, EmergencyKind.EARTHQUAKE])
+def test_motion_and_action_of_an_emergency_give_permits_and_code(
+    kind: EmergencyKind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = "EARTHQUAKE" if kind is EmergencyKind.EARTHQUAKE else "EMERGENCY"
+    row: Condition = getattr(emergency_latch, name)
+    latch = EmergencyLatch()
+    latch.raise_emergency(kind, "a")
+    before = latch.verdict(1, 0.0)
+    assert before is not None
+    assert (before.forward, before.code) == (row.motion is not Motion.NONE, EventCode.ABORTED)
+    other = Motion.ANY if row.motion is Motion.NONE else Motion.NONE
+    monkeypatch.setattr(emergency_latch, name, replace(row, motion=other, action=Action.RETREAT))
+    after = latch.verdict(1, 0.0)
+    assert after is not None
+    assert (after.forward, after.code) == (not before.forward, EventCode.NEAR_EDGE)
