@@ -264,6 +264,7 @@ def test_the_log_tells_states_by_session(tmp_path: Path, run: str, state: str) -
 VERDICT = {
     "logger": "danger",
     "event": "verdict_changed",
+    "condition": "estimate_stale",
     "code": 0,
     "signal": "estimate",
     "value": 0.31,
