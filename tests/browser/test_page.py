@@ -132,7 +132,7 @@ def alarm(name: str, severity: Any, **fields: Any) -> Alarm:
 
 async def test_a_pause_is_no_alarm_and_a_fault_is_one_in_colour_and_in_words(operator: Operator) -> None:
     state = "document.querySelector('#state').dataset.level"
-    operator.status = {"state": "held", "cause": "operator"}
+    operator.status = {"state": "held", "cause": "operator", "condition": "operator"}
     await operator.until(state, "note")
     await operator.until_text("#state", "held by an operator")
     await operator.until_text("#held", "held, the mission is held")

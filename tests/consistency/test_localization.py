@@ -146,7 +146,7 @@ def band(freedom: int) -> tuple[float, float]:
     return float(chi2.ppf(0.5 * ALPHA, freedom)) / freedom, float(chi2.ppf(1.0 - 0.5 * ALPHA, freedom)) / freedom
 
 
-@pytest.mark.parametrize("name", ["ekf", "ukf"])
+@pytest.mark.parametrize("name", ["ekf", pytest.param("ukf", marks=pytest.mark.slow)])
 def test_errors_are_as_large_as_the_covariance_says(name: str) -> None:
     """At each look the robots are independent: the sum over the seeds is chi-squared, with its degrees of freedom."""
     runs = [run(name, seed) for seed in range(SEEDS)]

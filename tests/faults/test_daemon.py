@@ -250,7 +250,7 @@ async def test_frames_that_are_old_for_good_are_reported_as_that_and_are_a_fault
         }
 
 
-@pytest.mark.parametrize("rate", [-0.01, 0.01])
+@pytest.mark.parametrize("rate", [pytest.param(-0.01, marks=pytest.mark.slow), 0.01])
 async def test_a_robot_whose_clock_is_wrong_by_a_hundredth_is_not_late(rate: float) -> None:
     """Its frames come every (1 + ``rate``) times their period."""
     boot_s = asyncio.get_running_loop().time()

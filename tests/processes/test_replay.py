@@ -251,7 +251,10 @@ def begin(tmp_path: Path, runtime_dir: Path) -> Iterator[Begin]:
 
 @pytest.mark.parametrize(
     ("system", "settings"),
-    [*SHORT.items(), *(pytest.param(*item, marks=pytest.mark.slow, id=f"longer {item[0]}") for item in LONGER.items())],
+    [
+        *(pytest.param(*item, marks=[] if item[0] == "zigbee" else pytest.mark.slow) for item in SHORT.items()),
+        *(pytest.param(*item, marks=pytest.mark.slow, id=f"longer {item[0]}") for item in LONGER.items()),
+    ],
 )
 def test_the_daemon_does_what_the_rehearsal_does(begin: Begin, system: str, settings: tuple[str, ...]) -> None:
     run = begin(system, *(part for setting in settings for part in ("--set", setting)), "--json")

@@ -104,6 +104,7 @@ def test_ctrl_c_keeps_what_is_done(started: Callable[..., subprocess.Popen[str]]
     assert keys_of(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     def little_room() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (1500, 1500))

@@ -352,3 +352,10 @@ def test_what_the_gyroscope_shows_at_rest_is_no_turn_afterwards() -> None:
     biased = always(wz_rad_s=0.25)
     seen = robot.run(4.0, biased)[10:] + robot.run(8.0, biased, drives)  # the first frames have no estimate
     assert {text_of(verdict.cause) for verdict in seen} == {""}
+
+
+@pytest.mark.parametrize("row", TABLE.values(), ids=TABLE)
+def test_a_condition_that_pauses_holds_or_is_a_fault_permits_no_motion(row: Condition) -> None:
+    """Also if its severity was raised: the denials of a frame follow from the permitted motion of each row."""
+    if {row.severity, row.raised_severity} & {Severity.PAUSE, Severity.HOLD, Severity.FAULT}:
+        assert row.motion is Motion.NONE
