@@ -154,6 +154,8 @@ def test_the_exact_steps_of_value_and_rate(axis: int, step: float, limit: float,
         twist = drive(under_test, Twist(*(sign * wanted if each == axis else 0.0 for each in range(2))))
         return sign * (twist.v_m_s, twist.omega_rad_s)[axis]
 
+    assert passed(0.9 * limit) == pytest.approx(step)  # within the limit, too fast for the first step
+    assert passed(0.0) == 0.0
     assert [passed(9.0), passed(9.0)] == pytest.approx([step, 2.0 * step])
     assert [passed(9.0) for _ in range(10)][-1] == pytest.approx(1.25 * limit)
     # Slower at once, and through zero one step only.
