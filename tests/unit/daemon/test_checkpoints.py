@@ -357,6 +357,28 @@ def test_the_checkpoint_is_due_ten_times_a_second_and_at_each_hold_or_abort(driv
     assert found.state == structs.replace(mission.state, route=Route((), (0.0,)), done=())
 
 
+@pytest.mark.parametrize("change", ["none", "number of the format", "cause", "abort_cause", "finding"])
+def test_a_checkpoint_of_an_older_format_is_refused(driving: Story, tmp_path: Path, change: str) -> None:
+    """In formats 1 and 2 causes were texts, and the state is an array, so that nothing may be read by its place."""
+    found = Checkpoint(1, 1, 0.01, 0.01, DeckPose(0.0, 0.0, 0.0), 1e-4, 1e-3, 0.0, 0.0, driving.mission.state)
+    record = msgspec.msgpack.decode(msgspec.msgpack.encode(found))
+    assert record[0] == 3
+    if change == "number of the format":
+        record[0] = 2
+    elif change != "none":
+        state = record[1 + Checkpoint.__struct_fields__.index("state")]
+        state[SurveyState.__struct_fields__.index(change)] = "earthquake"
+    file = CheckpointFile(tmp_path / FILE, is_patient=True)
+    for _ in range(2):
+        file.write(record)
+    file.close()
+    if change == "none":
+        assert read_checkpoint(tmp_path / FILE, Checkpoint) is not None
+        return
+    with pytest.raises(CheckpointError, match=r"checkpoint: of another version of ccatp \(.*\), so the robot's place"):
+        read_checkpoint(tmp_path / FILE, Checkpoint)
+
+
 @pytest.mark.parametrize(
     ("state", "v", "omega", "sigmas"),
     [
