@@ -94,7 +94,7 @@ def export(path: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: 
 
     A TUM trajectory is the path for evo and others: deck frame, m, and mission time, which is the robot's clock until
     it restarts or steps. A ROS 2 bag has every sample as a message of its own, for ROS, Foxglove and PlotJuggler: frame
-    map (the deck), SI units, UTC. Of a run that was resumed the newest recording is taken.
+    map (the deck), SI units, UTC. Of a run that was resumed the newest recording with frames is taken.
     """
     from ccatp.mirror.mirror import build_mirror
     from ccatp.records.recorder import iter_messages

@@ -184,6 +184,7 @@ class Recording:
     # What was left out. It is complete when ``messages`` has come to its end, as are the arrivals.
     warnings: list[str] = field(default_factory=list)
     arrivals: list[int] = field(default_factory=list)  # frames at which the robot stood at a point for the first time
+    sessions_without_frames: Sequence[Path] = ()  # other recordings of the run, which are left out
     _track: TraceBuilder = field(default_factory=TraceBuilder)
     _truth: list[tuple[float, ...]] = field(default_factory=list)
     _timeline: Timeline | None = None
@@ -202,8 +203,13 @@ class Recording:
 
     @property
     def notes(self) -> list[str]:
-        """What a reader has to know about the axis: restarts of the robot, steps of its clock."""
-        return [f"{self.path}: {note}" for note in self.timeline.notes]
+        """What a reader has to know: restarts of the robot, steps of its clock, sessions that are left out."""
+        left_out = [f"{path}: left out, it holds no frame of the robot" for path in self.sessions_without_frames]
+        return [*left_out, *(f"{self.path}: {note}" for note in self.timeline.notes)]
+
+    def has_frames(self) -> bool:
+        """The robot sent at least one frame; reads up to the first one."""
+        return _readable(self.path, lambda path: any(message.topic == "sensors" for message in iter_messages(path)))
 
     def config(self, overrides: Mapping[str, object]) -> Config:
         """The recorded configuration with ``overrides``; raises ``ConfigError`` where it cannot be used."""
@@ -278,11 +284,20 @@ def check_run_dir(run_dir: Path, file: str = CONFIG) -> None:
 
 
 def open_run(path: Path) -> list[Recording]:
-    """The recordings of a run directory, oldest first, or the one that is named; ``RunReadError``: none can be read."""
+    """The recordings of a run directory, oldest first, or the one that is named; ``RunReadError``: none can be read.
+
+    A session that was refused, or that ended before it had reached the robot, has recorded no frame. It is left out
+    where another session has frames.
+    """
     if path.is_file():
         return [_open(path)]
     check_run_dir(path, TELEMETRY)
-    return [_open(part) for part in recordings(path / TELEMETRY)]
+    parts = [_open(part) for part in recordings(path / TELEMETRY)]
+    with_frames = [part for part in parts if part.has_frames()]
+    if not with_frames:
+        return parts
+    with_frames[-1].sessions_without_frames = [part.path for part in parts if part not in with_frames]
+    return with_frames
 
 
 def _open(path: Path) -> Recording:

@@ -107,6 +107,17 @@ def test_an_older_recording_is_read_with_the_configuration_beside_it(tmp_path: P
     assert open_run(tmp_path)[0].config({}).run.seed == 5
 
 
+def test_a_session_without_a_frame_is_left_out_and_named(tmp_path: Path, config_text: str) -> None:
+    """A resume that was refused leaves such a recording; the frames of the run are in an older one."""
+    record(tmp_path, [("sensors", batch(0, 1))], config=config_text)
+    record(tmp_path, [("rest", Rest(seq=0, t_s=0.0))], config=config_text)
+    (recording,) = open_run(tmp_path)
+    assert (recording.path.name, len(list(recording.messages()))) == ("telemetry.1.mcap", 2)
+    assert recording.notes == [f"{tmp_path / 'telemetry.mcap'}: left out, it holds no frame of the robot"]
+    (alone,) = open_run(tmp_path / "telemetry.mcap")
+    assert not alone.has_frames()
+
+
 def test_missing_frames_are_counted(tmp_path: Path, config_text: str) -> None:
     record(tmp_path, [("sensors", batch(0, 1)), ("sensors", batch(4, 5, 9))], config=config_text)
     (recording,) = open_run(tmp_path)
