@@ -1,6 +1,6 @@
 """Value types shared by all packages (samples, poses, fixes, verdicts), angles, kinematics, steady robot time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from math import atan2, cos, pi, sin, tau
@@ -127,6 +127,22 @@ class Fix:
     detectable_m: float | None = None
     protection_m: float | None = None
     warnings: tuple[str, ...] = ()
+
+
+# What the redundant lengths of a fix say about it (``Fix.metrology``).
+GOOD, UNCHECKED, UNRELIABLE = "good", "unchecked", "unreliable"
+
+
+class Measured(NamedTuple):
+    """A point and its fix."""
+
+    point: PointId
+    fix: Fix
+
+
+def unreliable_points(measured: Iterable[Measured]) -> int:
+    """Number of points whose lengths contradict each other."""
+    return len({one.point for one in measured if one.fix.metrology == UNRELIABLE})
 
 
 class EventCode(IntEnum):

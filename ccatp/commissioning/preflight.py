@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 from ccatp.conditions import SAMPLE_RATES, SENSOR_TOO_SLOW, text_of
 from ccatp.config.models import Config
 from ccatp.control.thrust import forecast_grip
-from ccatp.core import Fix
+from ccatp.core import UNCHECKED, UNRELIABLE, Fix
 from ccatp.links.multiline import Environment
 from ccatp.links.robot_messages import Hello, Sensors
-from ccatp.mirror.length_integrity import UNCHECKED, UNRELIABLE
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.report.html import render

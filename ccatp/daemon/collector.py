@@ -14,7 +14,7 @@ import ccatp
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.core import FloatArray, PanelId, PointId
+from ccatp.core import FloatArray, PanelId, PointId, unreliable_points
 from ccatp.daemon.process import Endpoints
 from ccatp.daemon.terminal import RunView
 from ccatp.errors import ExitStatus
@@ -34,7 +34,7 @@ from ccatp.links.topics import (
     TruthMessage,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
-from ccatp.mirror.panel_alignment import fit_panels, unreliable_points
+from ccatp.mirror.panel_alignment import fit_panels
 from ccatp.records.recorder import (
     RECORD_FORMAT,
     TELEMETRY,

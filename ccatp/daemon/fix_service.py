@@ -17,13 +17,12 @@ from ccatp.conditions import (
     text_of,
 )
 from ccatp.config.models import MissionConfig
-from ccatp.core import NO_CAUSE, Cause, DeckPose, Fix, PointId, Vector3
+from ccatp.core import NO_CAUSE, UNRELIABLE, Cause, DeckPose, Fix, PointId, Vector3
 from ccatp.estimation.fixes import FixRefused
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry
 from ccatp.links.topics import FixMessage
 from ccatp.localizer import Localizer
-from ccatp.mirror.length_integrity import UNRELIABLE
 from ccatp.records.store import AlreadyMeasuredError, MissionStore, StoreError
 from ccatp.survey.events import Fault, FixFailed, FixStored, PointMissed
 from ccatp.survey.fix_gate import ApproachCounter, FixGate

@@ -24,10 +24,9 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from ccatp.config.models import EtalonConfig
-from ccatp.core import FloatArray, Vector3
+from ccatp.core import GOOD, UNCHECKED, UNRELIABLE, FloatArray, Vector3
 from ccatp.mirror.multilateration import MultilaterationError, RangeSolution, multilaterate
 
-GOOD, UNCHECKED, UNRELIABLE = "good", "unchecked", "unreliable"
 SURVEY_FIXES = 800  # number of fixes of a survey for which the probability of a false alarm is configured
 LOCATED_FROM = 6  # valid channels
 _DETECTED_FROM, _TWO_FROM = 5, 8

@@ -8,12 +8,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.config.models import AlignConfig
-from ccatp.core import PanelId, Vector3
-from ccatp.mirror.length_integrity import UNRELIABLE
+from ccatp.core import UNRELIABLE, Measured, PanelId, Vector3
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import (
     Deviations,
-    Measured,
     MirrorWavefront,
     PanelResult,
     Prices,

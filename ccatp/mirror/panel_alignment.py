@@ -15,17 +15,9 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from ccatp.config.models import LightConfig
-from ccatp.core import BoolArray, Fix, FloatArray, PanelId, PointId, Vector3
+from ccatp.core import UNRELIABLE, BoolArray, FloatArray, Measured, PanelId, PointId, Vector3
 from ccatp.mirror.layout import Panel
-from ccatp.mirror.length_integrity import UNRELIABLE
 from ccatp.mirror.mirror import Mirror
-
-
-class Measured(NamedTuple):
-    """A point and its fix."""
-
-    point: PointId
-    fix: Fix
 
 
 class Deviations(NamedTuple):
@@ -309,11 +301,6 @@ def mirror_wavefront(panels: Iterable[PanelWavefront]) -> MirrorWavefront | None
 
 # Least spread of the points. A single row, with an arrival tolerance of 10 mm, would give tilts of about 0.1 rad.
 _MIN_SPREAD_M = 0.02
-
-
-def unreliable_points(measured: Iterable[Measured]) -> int:
-    """Number of points whose lengths contradict each other."""
-    return len({one.point for one in measured if one.fix.metrology == UNRELIABLE})
 
 
 def fit_panels(mirror: Mirror, measured: Iterable[Measured], puck_height_m: float) -> dict[PanelId, Vector3]:

@@ -15,14 +15,13 @@ import numpy as np
 from ccatp.config.files import read_input
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import Fix, FloatArray, IntArray, PanelId, PointId, Vector3
+from ccatp.core import Fix, FloatArray, IntArray, Measured, PanelId, PointId, Vector3
 from ccatp.errors import UsageError
 from ccatp.links import topics
 from ccatp.links.bus import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, deck_rows
-from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import RECORD_FORMAT, TELEMETRY, decode_recorded, iter_messages, read_metadata, recordings
 from ccatp.records.store import StoreError, read_survey
 from ccatp.records.timeline import Timeline, first_of_each, iter_places, read_timeline

@@ -25,8 +25,7 @@ from queue import SimpleQueue
 from typing import Any, NamedTuple, Self
 
 from ccatp.config.files import sync_folder
-from ccatp.core import DeckPose, Fix, PointId
-from ccatp.mirror.panel_alignment import Measured
+from ccatp.core import DeckPose, Fix, Measured, PointId
 
 SCHEMA_VERSION = 2
 BUSY_TIMEOUT_S = 30.0  # an outside reader may hold its lock for this long

@@ -12,11 +12,10 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ccatp.core import DeckPose, Fix, FloatArray, PointId, StopKind
+from ccatp.core import UNRELIABLE, DeckPose, Fix, FloatArray, PointId, StopKind
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.filters.metrics import Consistency, consistency, rms
 from ccatp.mirror.layout import POINTS_PER_PANEL
-from ccatp.mirror.length_integrity import UNRELIABLE
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m, distribution, measured_error_m
 from ccatp.records.timeline import common_rows, row_before, rows_of

@@ -15,11 +15,10 @@ import numpy as np
 from ccatp.config.files import read_text
 from ccatp.config.load import is_radio_file, load_config
 from ccatp.config.models import Config
-from ccatp.core import FloatArray, PanelId, Vector3
+from ccatp.core import FloatArray, Measured, PanelId, Vector3
 from ccatp.links.bus import BadMessage
 from ccatp.links.topics import ArrivalMessage, FixMessage, MissionStatus
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
-from ccatp.mirror.panel_alignment import Measured
 from ccatp.mirror.surface import MirrorError
 from ccatp.records.recorder import TELEMETRY, damage_text, decode_recorded, read_metadata, recordings
 from ccatp.records.run_reader import CONFIG, STORE, RunReadError, Trace, check_run_dir, read_truth, trace_of_truth

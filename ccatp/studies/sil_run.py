@@ -15,7 +15,19 @@ import numpy as np
 
 from ccatp.conditions import text_of
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelPose, PointId, SteadyTime, Verdict, difference
+from ccatp.core import (
+    DeckPose,
+    EventCode,
+    Fix,
+    FloatArray,
+    Measured,
+    PanelPose,
+    PointId,
+    SteadyTime,
+    Verdict,
+    difference,
+    unreliable_points,
+)
 from ccatp.daemon.mission_runner import STILL, DriveCommand, TimedFrame
 from ccatp.daemon.survey_runner import SurveyFrames
 from ccatp.danger import DangerMonitor
@@ -29,7 +41,7 @@ from ccatp.localizer import Localizer
 from ccatp.mirror.fix_judgement import FixJudge
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError
-from ccatp.mirror.panel_alignment import Measured, fit_panels, unreliable_points
+from ccatp.mirror.panel_alignment import fit_panels
 from ccatp.records.run_reader import TraceBuilder
 from ccatp.records.summary import PanelFits, SummaryBuilder
 from ccatp.sim.fault_plan import FaultPlan, Injected

@@ -13,14 +13,13 @@ import pytest
 
 from ccatp.cli import main
 from ccatp.config.models import AlignConfig, Config
-from ccatp.core import DeckPose, Fix, FloatArray, PanelId, PointId, Vector3
+from ccatp.core import DeckPose, Fix, FloatArray, Measured, PanelId, PointId, Vector3
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import SurveyResult, compare, survey_result
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.multilateration import solve_fix
 from ccatp.mirror.panel_alignment import (
     Deviations,
-    Measured,
     Modes,
     PanelResult,
     PanelWavefront,

@@ -13,7 +13,7 @@ from ccatp.beacons.mission import MODES
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
-from ccatp.core import Cause, DeckPose, EventCode, Fix, PanelId, PanelPose, PointId, Severity, Verdict
+from ccatp.core import Cause, DeckPose, EventCode, Fix, Measured, PanelId, PanelPose, PointId, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.topics import (
     Alarm,
@@ -30,7 +30,6 @@ from ccatp.links.topics import (
     TrackMessage,
     TruthMessage,
 )
-from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import StoredPoint, StoredSurvey
 from ccatp.report.dashboard.access import CommandRefusal, check_command, host_refusal, make_token, page_tokens

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy import optimize, stats
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, FloatArray, PanelId
+from ccatp.core import DeckPose, FloatArray, Measured, PanelId
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.multilateration import MultilaterationError, multilaterate, solve_fix
-from ccatp.mirror.panel_alignment import Measured, deviations_of, fit_panels
+from ccatp.mirror.panel_alignment import deviations_of, fit_panels
 from tests.unit.aligning.test_panel_alignment import exact_fix
 
 HEIGHT_M = 0.05

@@ -11,7 +11,7 @@ from ccatp.conditions import text_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config, load_config, load_radio_config
 from ccatp.config.models import Config
-from ccatp.core import Cause, DeckPose, PanelId, PointId
+from ccatp.core import Cause, DeckPose, Measured, PanelId, PointId
 from ccatp.daemon.mission_runner import TimedFrame
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
@@ -34,7 +34,6 @@ from ccatp.links.topics import (
     schema_of,
 )
 from ccatp.mirror.misalignment import PanelMisalignment
-from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.survey.behaviours import MissionCommand
