@@ -34,7 +34,6 @@ from ccatp.links.topics import (
     TruthMessage,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
-from ccatp.mirror.panel_alignment import fit_panels
 from ccatp.records.recorder import (
     RECORD_FORMAT,
     TELEMETRY,
@@ -286,6 +285,9 @@ class SurveyRecord:
             return None
 
     def _fits(self, survey: StoredSurvey) -> PanelFits:
+        # SciPy would delay the start of each run by a fifth of a second, and is used at its end only.
+        from ccatp.mirror.panel_alignment import fit_panels  # noqa: PLC0415
+
         return fit_panels(self.mirror, survey.fixes, self._cfg.robot.puck_height_m)
 
 

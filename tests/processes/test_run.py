@@ -364,6 +364,14 @@ print(json.dumps([status, [name for name in {HEAVY!r} if name in sys.modules]]))
     assert not result.stderr
 
 
+@pytest.mark.parametrize("process", ["supervisor", "danger_loop", "dashboard", "sim_robot", "sim_etalon"])
+def test_only_the_main_loop_imports_scipy(process: str) -> None:
+    """It takes a fifth of a second of each start, and of each restart of the process that watches the rim."""
+    code = f"import sys, ccatp.daemon.{process}; print('scipy' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert result.stdout == "False\n"
+
+
 def test_a_closed_pipe_is_no_traceback() -> None:
     reader, writer = os.pipe()
     os.close(reader)
