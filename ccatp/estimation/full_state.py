@@ -155,6 +155,8 @@ class FullStateLocalizer(LocalizerBase):
         transitions = self._edges.scan(edges)
         # Wheels without samples do not count as standing.
         is_stop = is_still and self._right.is_fresh and self._left.is_fresh and rest.stood(dt_s)
+        if is_stop:
+            self._rest_wheels(set_points)
         # In a gap every frame is a step of the filter, so that the covariance is that of the frame.
         if transitions or is_stop or self._block.dt_s >= self._update_period_s or coasted is not None:
             self._end_block(transitions, coasted, is_stop=is_stop)
@@ -163,8 +165,7 @@ class FullStateLocalizer(LocalizerBase):
     def _stand(self, dt_s: float, imu: ImuReadings, edges: Edges, gravity: Gravity, set_points: WheelInput) -> None:
         """Take a frame at rest."""
         self._rebase()  # at rest the sums contain only noise
-        if set_points is not None and set_points[0] == set_points[1] == 0.0:
-            self._coast.stand()
+        self._rest_wheels(set_points)
         self._rested_s += dt_s
         self._block.stand(imu)
         self._rest.add(imu, gravity)
@@ -172,6 +173,11 @@ class FullStateLocalizer(LocalizerBase):
             self._use_rest(self.t_s)
         self._edges.scan(edges)
         self._locate()
+
+    def _rest_wheels(self, set_points: WheelInput) -> None:
+        """Wheels at rest without a set point have no follow error."""
+        if set_points is not None and set_points[0] == set_points[1] == 0.0:
+            self._coast.stand()
 
     def _end_block(
         self, transitions: Sequence[SensorTransition], coasted: CoastedMotion | None, *, is_stop: bool

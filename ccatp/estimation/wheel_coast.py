@@ -7,6 +7,7 @@ set point is zero does not depend on T at all; T matters only while the wheel ru
 
 What is not known, as the covariance of both angles' errors since the begin of the gap:
 
+* the moment at which a set point acts, within the step of the control loop, times its change;
 * the follow error at its begin (dead time of the control loop, readings of the angles): it appears with the share
   1 - exp(-t/T);
 * the load of a wheel (slope, friction): a real servo follows its set point only to a share of the travel, which is
@@ -58,12 +59,13 @@ WheelInput = SetPoints | CoastedMotion | None
 class LoadShares(NamedTuple):
     """Variance of the share of its travel that a wheel owes: ``mean`` of both wheels, ``half`` of their difference.
 
-    ``seen_s``: motion from which it is known.
+    ``seen``: weight of the motion from which it is known, rad^4 s. The error of a share falls with the travel, its
+    variance with the fourth power of it.
     """
 
     mean: float = 0.5 * _LOAD_SHARE**2
     half: float = 0.5 * _LOAD_SHARE**2
-    seen_s: float = _LOAD_PRIOR_S
+    seen: float = _LOAD_PRIOR_S * _LOADED_RAD**4
 
     @property
     def one(self) -> float:
@@ -75,12 +77,14 @@ class LoadShares(NamedTuple):
         """Covariance of both wheels, each in its own direction."""
         return self.mean - self.half
 
-    def learned(self, dt_s: float, mean2: float, half2: float) -> "LoadShares":
-        """With a new square of each, after ``dt_s`` of motion."""
-        seen_s = min(self.seen_s + dt_s, _LOAD_MEMORY_S)
-        weight, least2 = dt_s / seen_s, 0.5 * _LEAST_LOAD_SHARE**2
-        mean, half = self.mean + weight * (mean2 - self.mean), self.half + weight * (half2 - self.half)
-        return LoadShares(max(mean, least2), max(half, least2), seen_s)
+    def learned(self, dt_s: float, travel_rad: float, mean_rad2: float, half_rad2: float) -> "LoadShares":
+        """With the square of what mean and half difference owe after a travel, in ``dt_s`` of motion."""
+        travel2, least2 = travel_rad * travel_rad, 0.5 * _LEAST_LOAD_SHARE**2
+        new = dt_s * travel2 * travel2
+        seen = self.seen * max(1.0 - dt_s / _LOAD_MEMORY_S, 0.0) + new
+        mean = self.mean + new / seen * (mean_rad2 / travel2 - self.mean)
+        half = self.half + new / seen * (half_rad2 / travel2 - self.half)
+        return LoadShares(max(mean, least2), max(half, least2), seen)
 
 
 class WheelCoast:
@@ -131,8 +135,7 @@ class WheelCoast:
             # The error of the lag is the same for both wheels, that of the rates is not.
             mean2 = (0.5 * (right + left)) ** 2 - 0.5 * of_rate - self._spread2 * right_rad_s * right_rad_s
             half2 = (0.5 * (right - left)) ** 2 - 0.5 * of_rate
-            seen2 = travel * travel
-            self._shares[is_turn] = self._shares[is_turn].learned(dt_s, mean2 / seen2, half2 / seen2)
+            self._shares[is_turn] = self._shares[is_turn].learned(dt_s, travel, mean2, half2)
         for rate, off, travel in zip(rates, owed, self._travels, strict=True):
             if -_FAST_RAD_S < rate < _FAST_RAD_S:
                 continue
@@ -145,7 +148,9 @@ class WheelCoast:
     def begin(self, right_rad_s: float, left_rad_s: float, reading_rad2: float, *, is_resting: bool) -> None:
         """Begin a gap at these rates of the wheels; ``reading_rad2``: variance of an angle's reading."""
         self._first2, self._shown2 = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]  # right, left, both
+        self._first_set: tuple[float, float] | None = None
         self._by_lag, self._largest = (0.0, 0.0), 0.0
+        self._largest_step = 0.0  # square of the largest change of the set points in the gap
         self._coasted = [0.0, 0.0]
         self._is_turn = right_rad_s * left_rad_s < 0.0
         self._kept, self._free = 1.0, (right_rad_s, left_rad_s)
@@ -191,6 +196,7 @@ class WheelCoast:
     def _advance(self, dt_s: float, set_points: SetPoints) -> CoastedMotion:
         lag_s, follows, turns, changes = self._lag_s, self._follows, [0.0, 0.0], [0.0, 0.0]
         keep = exp(-dt_s / lag_s)
+        self._first_set = first_set = self._first_set or set_points[:2]
         for k in (0, 1):
             u, follow = set_points[k], follows[k]
             off = follow - u * lag_s
@@ -202,6 +208,11 @@ class WheelCoast:
         size = right * right + left * left
         grown = self._spread2 * (size - self._largest) / size if size > self._largest else 0.0
         self._largest = max(size, self._largest)
+        # Likewise the dead time of the set points that change in the gap.
+        steps = set_points[0] - first_set[0], set_points[1] - first_set[1]
+        size = steps[0] * steps[0] + steps[1] * steps[1]
+        late = _DEAD_TIME_S**2 * (size - self._largest_step) / size if size > self._largest_step else 0.0
+        self._largest_step = max(size, self._largest_step)
         self._kept *= keep
         shown = (1.0 - self._kept) ** 2
         # A wrong rate is wrong in the whole gap, so that its error grows with the travel and not with its root.
@@ -220,7 +231,7 @@ class WheelCoast:
         return CoastedMotion(
             *turns,
             *(
-                grown * changes[i] * changes[j] + now - old + stops[i] * stops[j]
+                grown * changes[i] * changes[j] + late * steps[i] * steps[j] + now - old + stops[i] * stops[j]
                 for now, old, (_, i, j) in zip(self._shown2, before, pairs, strict=True)
             ),
         )

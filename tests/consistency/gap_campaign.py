@@ -7,7 +7,7 @@ cell without a gap.
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -66,9 +66,17 @@ class Cell(NamedTuple):
     @property
     def is_inflated(self) -> bool:
         """The covariance is larger than the errors."""
+        return self._is_above(lambda now: now.rms)
+
+    @property
+    def is_surely_inflated(self) -> bool:
+        """It is, whatever rms error within the 99 % band the few seeds stand for."""
+        return self._is_above(lambda now: now.rms * float(np.sqrt(now.freedom / now.band(self.seeds)[0])))
+
+    def _is_above(self, rms: Callable[[Figures], float]) -> bool:
         pairs = zip((self.position, self.heading), self.without, (FLOOR_M, FLOOR_RAD), strict=True)
         return any(
-            now.sigma > max(2.0 * now.rms, 1.3 * without.sigma / without.rms * now.rms, floor)
+            now.sigma > max(2.0 * rms(now), 1.3 * without.sigma / without.rms * rms(now), floor)
             for now, without, floor in pairs
         )
 
