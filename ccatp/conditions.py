@@ -13,9 +13,7 @@ from functools import partial
 from math import isfinite
 from typing import NamedTuple, ParamSpec
 
-from ccatp.core import Cause, EventCode, Severity, Verdict
-
-Permits = tuple[bool, bool, bool]  # forward, reverse, turn
+from ccatp.core import ALL_MOTION, NO_MOTION, Cause, EventCode, Permits, Severity, Verdict
 
 
 class Motion(Enum):
@@ -27,11 +25,11 @@ class Motion(Enum):
     ABORT = "home, because it is called"
     NONE = "nothing"
 
-    def permits(self, away: Permits = (True, True, True)) -> Permits:
+    def permits(self, away: Permits = ALL_MOTION) -> Permits:
         """The permits of a verdict; ``away``: those of a retreat."""
         if self is Motion.NONE:
-            return False, False, False
-        return away if self is Motion.RETREAT else (True, True, True)
+            return NO_MOTION
+        return away if self is Motion.RETREAT else ALL_MOTION
 
 
 class Clear(Enum):
@@ -191,8 +189,10 @@ class MonitorFinding(NamedTuple):
 
     def verdict(self, seq: int, t_s: float, code: EventCode) -> Verdict:
         """The verdict on frame ``seq`` if nothing else is found."""
-        shown = self.cause, self.signal, self.value, self.limit
-        return Verdict(seq, t_s, code, *shown, *self.condition.motion.permits(), severity=self.severity)
+        permits = self.condition.motion.permits()
+        return Verdict(
+            seq, t_s, code, self.cause, self.signal, self.value, self.limit, *permits, severity=self.severity
+        )
 
 
 TABLE: dict[str, Condition] = {}  # all registered rows by name

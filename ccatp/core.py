@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from math import atan2, cos, pi, sin, tau
-from typing import Annotated, NamedTuple, TypeVar
+from typing import Annotated, NamedTuple, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -153,6 +153,9 @@ class EventCode(IntEnum):
     ABORTED = 2
 
 
+_NORMAL = EventCode.NORMAL  # looking up a member of the enum in every frame costs more than making a verdict
+
+
 class Severity(IntEnum):
     """Severity of a finding; of several findings the highest counts."""
 
@@ -195,6 +198,17 @@ class Cause(msgspec.Struct, frozen=True, omit_defaults=True):
 NO_CAUSE = Cause()
 
 
+class Permits(NamedTuple):
+    """Motion that is permitted; a turn is one in place."""
+
+    forward: bool
+    reverse: bool
+    turn: bool
+
+
+ALL_MOTION, NO_MOTION = Permits(True, True, True), Permits(False, False, False)
+
+
 class Verdict(msgspec.Struct, frozen=True):
     """The danger loop's verdict on one sensors frame."""
 
@@ -213,6 +227,16 @@ class Verdict(msgspec.Struct, frozen=True):
     full_fans: bool = False
     raised: int = 0  # number of emergencies raised so far while one is latched
     is_shaking: bool = False  # an earthquake is latched, even if code and cause are of another rule
+
+    @classmethod
+    def normal(cls, seq: int, t_s: float) -> Self:
+        """Nothing is found, and all motion is permitted."""
+        return cls(seq, t_s, _NORMAL, NO_CAUSE, "", 0.0, 0.0, *ALL_MOTION)
+
+    @property
+    def permits(self) -> Permits:
+        """The motion that it permits."""
+        return Permits(self.forward, self.reverse, self.turn)
 
 
 class Twist(msgspec.Struct, frozen=True):

@@ -24,7 +24,7 @@ import msgspec
 from ccatp import conditions
 from ccatp.conditions import MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.core import NO_CAUSE, Corner, EdgeSample, EventCode, SteadyTime, Verdict, WheelSample
+from ccatp.core import NO_MOTION, Corner, EdgeSample, EventCode, Permits, SteadyTime, Verdict, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
@@ -38,7 +38,6 @@ from ccatp.sensing.sample_times import possible_samples
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1
 EVERYWHERE = (True, True, True, True)
-_NORMAL = EventCode.NORMAL  # looking up a member of the enum in every frame costs more than making the verdict
 
 
 class DangerMonitor(EmergencyRules):
@@ -124,7 +123,7 @@ class DangerMonitor(EmergencyRules):
             found = self._look(board, sensors, t_s, wheels, samples)
         self.found = ()
         if not found and not missing and edges.is_idle and not origin.direction and not self.latch.is_latched:
-            self.verdict = verdict = Verdict(seq, sensors.t, _NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+            self.verdict = verdict = Verdict.normal(seq, sensors.t)
             if board is not None and self._escalation.is_counting:
                 self._escalation.escalate(t_s, [])
         else:
@@ -250,15 +249,15 @@ class DangerMonitor(EmergencyRules):
         missing = gravest(findings)
         if self._edges.is_lifted:
             row = conditions.ALL_OFF
-            shown = row.because(), "edge", 4.0, 3.0
-            return Verdict(seq, t_s, row.code, *shown, *row.motion.permits(), EVERYWHERE)
+            permits = row.motion.permits()
+            return Verdict(seq, t_s, row.code, row.because(), "edge", 4.0, 3.0, *permits, off=EVERYWHERE)
         declared = self._declared()
         if declared is not None or self._origin.direction:
             return self._edge_verdict(seq, t_s, declared, missing)
         if missing is not None:
             return self._denied(seq, t_s, missing)
         emergency = self.latch.verdict(seq, t_s)
-        return emergency or Verdict(seq, t_s, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+        return emergency or Verdict.normal(seq, t_s)
 
     def _edge_verdict(
         self, seq: int, t_s: float, declared: EdgeDetector | None, missing: MonitorFinding | None
@@ -274,7 +273,7 @@ class DangerMonitor(EmergencyRules):
             row, signal = conditions.CENTRE_NEAR_RIM, "estimate"
             value, limit = origin.clearance_m, origin.limit_m
         forward, reverse = barred <= 0 and not (off[0] or off[1]), barred >= 0 and not (off[2] or off[3])
-        cause, permits = row.because(), row.motion.permits((forward, reverse, turn))
+        cause, permits = row.because(), row.motion.permits(Permits(forward, reverse, turn))
         if missing is not None:
-            cause, permits = msgspec.structs.replace(cause, besides=missing.cause), (False, False, False)
-        return Verdict(seq, t_s, row.code, cause, signal, value, limit, *permits, off)
+            cause, permits = msgspec.structs.replace(cause, besides=missing.cause), NO_MOTION
+        return Verdict(seq, t_s, row.code, cause, signal, value, limit, *permits, off=off)

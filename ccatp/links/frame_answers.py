@@ -7,7 +7,7 @@ with the answers, is ``ccatp.onboard.rules``. ``tests/property/test_two_keys.py`
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ccatp.core import Verdict
+from ccatp.core import NO_MOTION, Permits, Verdict
 from ccatp.links.robot_messages import Drive, Permit
 
 # The rate of the robot's clock may be wrong by 1 % and may change; that of the host is much better.
@@ -78,12 +78,11 @@ class JudgedFrame:
     verdict: Verdict
 
 
-def permitted(newest: FrameId | None, judged: JudgedFrame | None) -> tuple[bool, bool, bool]:
-    """The motion (forward, reverse, turn) permitted on the newest frame: that of its own verdict, otherwise none."""
+def permitted(newest: FrameId | None, judged: JudgedFrame | None) -> Permits:
+    """The motion permitted on the newest frame: that of its own verdict, otherwise none."""
     if judged is None or judged.frame != newest:
-        return False, False, False
-    verdict = judged.verdict
-    return verdict.forward, verdict.reverse, verdict.turn
+        return NO_MOTION
+    return judged.verdict.permits
 
 
 class PermitRule:

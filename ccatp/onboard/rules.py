@@ -9,12 +9,11 @@ from collections import deque
 from math import hypot, inf, isfinite
 from typing import Any, Literal
 
-from ccatp.core import twist_of
+from ccatp.core import ALL_MOTION, Permits, twist_of
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role
 from ccatp.slide_rule import SlideRule
 
 HELD = (0.0, 0.0)
-_EVERYTHING = (True, True, True)
 _BIAS_TIME_S = 1.0
 _MOTION: dict[Role, str] = {"controller": "drive", "monitor": "permit"}  # command of a role that moves the robot
 
@@ -35,7 +34,7 @@ class MotionRules:
     def __init__(self, ttl_s: float, max_wheel_rad_s: float) -> None:
         self._ttl_s, self._max_wheel_rad_s = ttl_s, max_wheel_rad_s
         self._drive: tuple[float, float] | None = None
-        self._permit: tuple[bool, bool, bool] | None = None
+        self._permit: Permits | None = None
         self._drive_seq = 0
         self._drive_s = self._permit_s = inf  # before the first of the boot: gives the age 0
         self.steer_rad = 0.0
@@ -60,7 +59,7 @@ class MotionRules:
 
     def permit(self, forward: bool, reverse: bool, turn: bool, now_s: float) -> None:
         """Take a permit that arrived at ``now_s``."""
-        self._permit, self._permit_s = (forward, reverse, turn), now_s
+        self._permit, self._permit_s = Permits(forward, reverse, turn), now_s
 
     def set_points(self, until_s: float) -> tuple[float, float]:
         """(right, left) wheel set points, rad/s, of a step to ``until_s``: drive and permit must last to its end."""
@@ -78,7 +77,7 @@ class MotionRules:
         permit = self._permit
         if permit is None or until_s - self._permit_s > limit_s:
             return False
-        if permit == _EVERYTHING:
+        if permit == ALL_MOTION:
             return True
         (right, left), (forward, reverse, turn) = drive, permit
         speed = right + left

@@ -23,7 +23,7 @@ from ccatp.conditions import (
     MonitorFinding,
 )
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import NO_CAUSE, EventCode, Verdict, wrap_pi
+from ccatp.core import EventCode, Permits, Verdict, wrap_pi
 from ccatp.links.beacon_messages import BeaconFrame
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
@@ -237,8 +237,9 @@ class BeaconSafetyRules(EmergencyRules):
         elif behind_m < danger.obstacle_m:
             row, found = OBSTACLE_BEHIND, ("obstacle", behind_m, danger.obstacle_m)
         else:
-            return emergency or Verdict(seq, t_s, _NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
-        return Verdict(seq, t_s, row.code, row.because(), *found, *row.motion.permits((forward, reverse, True)))
+            return emergency or Verdict.normal(seq, t_s)
+        permits = row.motion.permits(Permits(forward, reverse, turn=True))
+        return Verdict(seq, t_s, row.code, row.because(), *found, *permits)
 
     def _nearest_target_m(self) -> float:
         """Lower bound of the target's distance: mean level minus one standard deviation; infinite without a level."""

@@ -99,7 +99,7 @@ class BeaconSilWorld:
             self._summary.reached.append((sensors.seq, arrival.belief.ellipse))
         if not self.is_over:
             right, left, steer = wheel_rates(drive, self._cfg)
-            self.robot.permit(sensors.seq + 1, verdict.forward, verdict.reverse, verdict.turn)
+            self.robot.permit(sensors.seq + 1, *verdict.permits)
             self.robot.drive(sensors.seq + 1, right, left, None, steer)
             self.robot.advance()
             self.found.truth.append(self.robot.truth_row())

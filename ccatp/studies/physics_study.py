@@ -183,7 +183,7 @@ class Drive:
                 self._command_fans()
         twist = Twist(self._speed_m_s, wanted.omega_rad_s)
         right, left = wheel_rates(twist, cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m)
-        robot.permit(self._number, verdict.forward, verdict.reverse, verdict.turn)
+        robot.permit(self._number, *verdict.permits)
         robot.drive(self._number, right, left)
 
     def set_friction(self, friction: float) -> None:

@@ -277,7 +277,7 @@ class SilRun(SurveyFrames):
         if verdict is not None:
             self.denied_s.append(self.robot.t_s)
             self._drive_seq += 1  # numbers drives and permits alike here
-            self.robot.permit(self._drive_seq, verdict.forward, verdict.reverse, verdict.turn)
+            self.robot.permit(self._drive_seq, *verdict.permits)
 
     def _note_truth(self) -> None:
         self.trace.note_truth(self.robot.truth_row())
@@ -307,7 +307,7 @@ class SilRun(SurveyFrames):
             self._is_measuring = False
             self._measure(sensors)
             drive = STILL  # the held frame is answered by zeros
-        robot.permit(self._drive_seq + 1, verdict.forward, verdict.reverse, verdict.turn)
+        robot.permit(self._drive_seq + 1, *verdict.permits)
         self._drive(drive)
 
     def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:

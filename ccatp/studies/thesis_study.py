@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.core import NO_CAUSE, EdgeSample, EventCode, Fix, FloatArray, GravitySample, ImuSample, Verdict, WheelSample
+from ccatp.core import EdgeSample, Fix, FloatArray, GravitySample, ImuSample, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.localizer_base import SensorTransition
 from ccatp.estimation.thesis_localizer import THETA, FourStateLocalizer
@@ -128,7 +128,7 @@ class _NoEdges(DangerMonitor):
 
     def step(self, sensors: Sensors, estimate: EstimateMessage | None) -> Verdict:
         del estimate
-        return Verdict(sensors.seq, sensors.t, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+        return Verdict.normal(sensors.seq, sensors.t)
 
 
 class _Replica(SilRun):

@@ -13,6 +13,7 @@ from ccatp.commissioning.conformance import server_checks
 from ccatp.commissioning.conformance.command_checks import BAD_DRIVES
 from ccatp.commissioning.conformance.runner import check_ids
 from ccatp.config.models import Config
+from ccatp.core import Permits
 from ccatp.links.robot_codec import BadLineCounter, LineBuffer, join_mac
 from ccatp.links.robot_messages import Drive, Permit, Role
 from ccatp.links.robot_messages import Fans as FansMessage
@@ -515,7 +516,7 @@ def _curves(is_allowed: Callable[[bool, bool], tuple[bool, bool]]) -> Callable[[
             return MotionRules._may_move(self, drive, until_s)
         permit = forward, reverse, turn = self._permit
         straight, turn = is_allowed(forward if right > 0.0 else reverse, turn)
-        self._permit = straight, straight, turn
+        self._permit = Permits(straight, straight, turn)
         found = MotionRules._may_move(self, drive, until_s)
         self._permit = permit
         return found

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from ccatp.core import ALL_MOTION
 from ccatp.links.frame_answers import DriveRule, FrameId, PermitRule
 from ccatp.links.robot_messages import Drive, Permit, Role
 from ccatp.onboard.rules import MotionRules
@@ -85,7 +86,7 @@ class RulesMutant(MotionRules):
     def _may_move(self, drive: tuple[float, float], until_s: float) -> bool:
         allowed, permit = super()._may_move(drive, until_s), self._permit
         if self.fault == "a permit allows every direction":
-            self._permit = None if permit is None else (True, True, True)
+            self._permit = None if permit is None else ALL_MOTION
             allowed = super()._may_move(drive, until_s)
             self._permit = permit
         elif self.fault == "a permit never expires" and permit is not None:

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from ccatp.conditions import EMERGENCY, RIM_AHEAD
 from ccatp.config.models import Config
-from ccatp.core import NO_CAUSE, DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.events import FixStored, MissionState
@@ -20,7 +20,7 @@ from ccatp.survey.statechart import Mission, Survey
 
 DT, LAG = 0.01, 0.08
 PANEL = PanelId(5, 5)
-FREE = Verdict(0, 0.0, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+FREE = Verdict.normal(0, 0.0)
 FRONT_OFF = replace(
     FREE, code=EventCode.NEAR_EDGE, cause=RIM_AHEAD.because(), forward=False, turn=False, off=(True, True, False, False)
 )

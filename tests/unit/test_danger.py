@@ -17,7 +17,7 @@ from ccatp.conditions import (
     text_of,
 )
 from ccatp.config.models import Config
-from ccatp.core import NO_CAUSE, Corner, EdgeSample, EventCode, Verdict, WheelSample
+from ccatp.core import Corner, EdgeSample, EventCode, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
@@ -123,7 +123,7 @@ def permits(verdict: Verdict) -> tuple[bool, bool, bool]:
 
 def test_normal_operation_permits_everything(on_panel: Story) -> None:
     verdict = on_panel.run(3, v=0.1)
-    assert verdict == Verdict(3, verdict.t_s, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+    assert verdict == Verdict.normal(3, verdict.t_s)
     assert on_panel.monitor.counts["episodes"] == dict.fromkeys(Corner, 0)
 
 

@@ -11,9 +11,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 
 from ccatp.commissioning.conformance.harness import (
-    ALL,
     DUTY_TOLERANCE,
-    NOTHING,
     STILL,
     CheckContext,
     CheckFailed,
@@ -27,6 +25,7 @@ from ccatp.commissioning.conformance.harness import (
     require,
     steady,
 )
+from ccatp.core import ALL_MOTION, NO_MOTION
 from ccatp.links.robot_codec import MAX_LINE_BYTES, encode, format_drive
 from ccatp.links.robot_messages import Fans
 
@@ -156,7 +155,7 @@ def _newest_drive(pair: ControllerAndMonitor) -> str:
 def _pause_and_settle(pair: ControllerAndMonitor) -> None:
     """Wait until the sent messages have arrived, then answer frames again."""
     pair.pause(SHORT_S)
-    pair.rates, pair.allowed = STILL, ALL
+    pair.rates, pair.allowed = STILL, ALL_MOTION
     pair.settle()
 
 
@@ -335,7 +334,7 @@ def _fans_after_time_out(pair: ControllerAndMonitor) -> str:
 
 @check_fans("fans-stop", "fans are never changed by a stop")
 def _fans_after_stop(pair: ControllerAndMonitor) -> str:
-    pair.allowed = NOTHING
+    pair.allowed = NO_MOTION
     _check_unchanged(pair, pair.run_frames(10), "by a permit that allows nothing")
     return f"{_shown(pair.duty)} while nothing is allowed"
 

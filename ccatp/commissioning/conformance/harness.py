@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from ccatp.config.messages import format_key
 from ccatp.config.robot_limits import FrameRate, TimeToLive, WheelBase, WheelRadius, top_speed_problem
+from ccatp.core import ALL_MOTION, Permits
 from ccatp.links.robot_codec import LineBuffer, encode, format_drive, format_permit, join_mac
 from ccatp.links.robot_messages import AUTH_HMAC, Fans, Join, Role
 from ccatp.mirror.mirror import Mirror
@@ -26,10 +27,7 @@ Key = Literal["drive", "permit"]
 Ending = Literal["FIN", "RST"]
 Message = dict[str, Any]
 Pair = tuple[float, float]
-Allowed = tuple[bool, bool, bool]
 STILL: Pair = (0.0, 0.0)
-ALL: Allowed = (True, True, True)
-NOTHING: Allowed = (False, False, False)
 POLL_S = 0.05
 COMMAND_LIMIT_S = 2.0  # robot time within which a command must be in force
 DUTY_TOLERANCE = 0.01  # the robot may store a duty in eight bits
@@ -387,7 +385,7 @@ class ControllerAndMonitor:
         self.context, self.facts = context, context.facts
         self.join()
         self.rates: Pair | None = STILL
-        self.allowed: Allowed | None = ALL
+        self.allowed: Permits | None = ALL_MOTION
         self.duty: Pair = STILL
         self.frames: list[Frame] = []
         self.received_s: list[float] = []
@@ -425,7 +423,7 @@ class ControllerAndMonitor:
             self.mark_driven()
         return seq
 
-    def permit(self, seq: int | None = None, allowed: Allowed = ALL, ack: int | None = None) -> int:
+    def permit(self, seq: int | None = None, allowed: Permits = ALL_MOTION, ack: int | None = None) -> int:
         """Send a permit that answers the newest frame (or frame ``ack``); return its number."""
         seq = self.context.next_seq() if seq is None else seq
         self.monitor.send(format_permit(seq, self.newest.seq if ack is None else ack, *allowed))
@@ -527,7 +525,7 @@ class ControllerAndMonitor:
 
     def steady(self) -> Frame:
         """Answer frames until a drive of zero and a permit are in force and the robot is not held."""
-        self.rates, self.allowed = STILL, ALL
+        self.rates, self.allowed = STILL, ALL_MOTION
         first = self.context.next_seq()
         return self.expect(
             lambda frame: not frame.cmd.held and frame.cmd.seq > first,

@@ -6,9 +6,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 
 from ccatp.commissioning.conformance.harness import (
-    ALL,
     STILL,
-    Allowed,
     CheckContext,
     CheckFailed,
     CheckList,
@@ -22,6 +20,7 @@ from ccatp.commissioning.conformance.harness import (
     steady,
     whole_samples,
 )
+from ccatp.core import ALL_MOTION, Permits
 from ccatp.links.robot_messages import Role
 
 CHECKS = CheckList()
@@ -135,15 +134,32 @@ def _rate(facts: Facts) -> float:
 
 
 # Name, requirement, (right, left) share of the rate, permits (forward, reverse, turn) that allow and deny it.
-DIRECTIONS: tuple[tuple[str, str, Pair, Allowed, Allowed], ...] = (
-    ("move-forward", "v > 0 needs forward", (1, 1), (True, False, False), (False, True, True)),
-    ("move-reverse", "v < 0 needs reverse", (-1, -1), (False, True, False), (True, False, True)),
-    ("move-turn", "different wheel rates need turn", (1, -1), (False, False, True), (True, True, False)),
-    ("move-turn-back", "different wheel rates need turn", (-1, 1), (False, False, True), (True, True, False)),
-    ("move-curve", "a curve forward needs forward and turn", (1, 0.5), (True, False, True), (True, False, False)),
-    ("move-curve-back", "a curve in reverse needs reverse and turn", (-1, -0.5), (False, True, True),
-     (False, False, True)),
-)  # fmt: skip
+DIRECTIONS: tuple[tuple[str, str, Pair, Permits, Permits], ...] = (
+    ("move-forward", "v > 0 needs forward", (1, 1), Permits(True, False, False), Permits(False, True, True)),
+    ("move-reverse", "v < 0 needs reverse", (-1, -1), Permits(False, True, False), Permits(True, False, True)),
+    ("move-turn", "different wheel rates need turn", (1, -1), Permits(False, False, True), Permits(True, True, False)),
+    (
+        "move-turn-back",
+        "different wheel rates need turn",
+        (-1, 1),
+        Permits(False, False, True),
+        Permits(True, True, False),
+    ),
+    (
+        "move-curve",
+        "a curve forward needs forward and turn",
+        (1, 0.5),
+        Permits(True, False, True),
+        Permits(True, False, False),
+    ),
+    (
+        "move-curve-back",
+        "a curve in reverse needs reverse and turn",
+        (-1, -0.5),
+        Permits(False, True, True),
+        Permits(False, False, True),
+    ),
+)
 
 
 @contextmanager
@@ -164,7 +180,7 @@ def _at_rest(context: CheckContext) -> Iterator[ControllerAndMonitor]:
 check_at_rest = partial(CHECKS.add, fixture=_at_rest)
 
 
-def _direction(shares: Pair, allowed: Allowed, denied: Allowed, pair: ControllerAndMonitor) -> str:
+def _direction(shares: Pair, allowed: Permits, denied: Permits, pair: ControllerAndMonitor) -> str:
     """The same drive denied, then allowed, then denied again."""
     rate_rad_s = _rate(pair.facts)
     rates = rate_rad_s * shares[0], rate_rad_s * shares[1]
@@ -189,7 +205,7 @@ def _direction(shares: Pair, allowed: Allowed, denied: Allowed, pair: Controller
     return f"held when denied; allowed, the wheels turn at {seen[0]:.2f}, {seen[1]:.2f} rad/s"
 
 
-def _denied_again(pair: ControllerAndMonitor, denied: Allowed) -> list[Frame]:
+def _denied_again(pair: ControllerAndMonitor, denied: Permits) -> list[Frame]:
     """Frames in which a permit that denies the motion is in force and its time-to-live is not over."""
     if pair.facts.lockstep:
         pair.allowed = denied
@@ -214,7 +230,7 @@ def _stops_at_zero(pair: ControllerAndMonitor) -> str:
     rate_rad_s = _rate(pair.facts)
     seen = ""
     for rates in ((rate_rad_s, rate_rad_s), (-rate_rad_s, rate_rad_s)):
-        _move(pair, rates, ALL)
+        _move(pair, rates, ALL_MOTION)
         pair.rates = STILL
         pair.run(STOP_S)
         right, left = _seen_rates(pair.frames[-WINDOW:])
@@ -226,7 +242,7 @@ def _stops_at_zero(pair: ControllerAndMonitor) -> str:
 def _stops(key: Key, lost: Role | None, pair: ControllerAndMonitor) -> str:
     """The wheels stop without a newer drive or permit, or when the session that sends it is lost."""
     rate_rad_s = _rate(pair.facts) * (1.0 if lost is None else -1.0)
-    _move(pair, (rate_rad_s, rate_rad_s), ALL)
+    _move(pair, (rate_rad_s, rate_rad_s), ALL_MOTION)
     pair.withhold(key)
     if lost is None:
         pair.run(pair.facts.ttl_s)
@@ -251,7 +267,7 @@ def _clamp(pair: ControllerAndMonitor) -> str:
     seen = ""
     for sign in (1.0, -1.0):
         rates = sign * BEYOND[0] * most_rad_s, sign * BEYOND[1] * most_rad_s
-        right, left = _seen_rates(_turning(pair, rates, ALL))
+        right, left = _seen_rates(_turning(pair, rates, ALL_MOTION))
         seen = f"wheels at {right:.3g}, {left:.3g} rad/s for {rates[0]:g}, {rates[1]:g}, at most {most_rad_s:g}"
         require(abs(abs(right) / most_rad_s - 1.0) <= RATE_TOLERANCE and right * sign > 0.0, seen)
         require(abs(left / right - BEYOND[1] / BEYOND[0]) <= RATIO_TOLERANCE, seen)
@@ -266,7 +282,7 @@ def _gyroscope(pair: ControllerAndMonitor) -> str:
     rate_rad_s, robot = _rate(pair.facts), pair.facts.robot
     seen = []
     for rates in ((rate_rad_s, -rate_rad_s), (-rate_rad_s, rate_rad_s)):
-        frames = _move(pair, rates, ALL)
+        frames = _move(pair, rates, ALL_MOTION)
         right, left = _seen_rates(frames)
         seen.append((robot.wheel_radius_m * (right - left) / robot.wheel_base_m, _imu_mean(frames, 2)))
         pair.rates = STILL
@@ -310,7 +326,7 @@ def _imu_mean(frames: Sequence[Frame], column: int) -> float:
     return sum(sample[column] for sample in samples) / len(samples)
 
 
-def _move(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> list[Frame]:
+def _move(pair: ControllerAndMonitor, rates: Pair, allowed: Permits) -> list[Frame]:
     """Frames in which the wheels turn at the set points; ``CheckFailed`` if they do not."""
     frames = _turning(pair, rates, allowed)
     right, left = _seen_rates(frames)
@@ -320,7 +336,7 @@ def _move(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> list[Fra
     return frames
 
 
-def _turning(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> list[Frame]:
+def _turning(pair: ControllerAndMonitor, rates: Pair, allowed: Permits) -> list[Frame]:
     """Frames of a drive after the servo has settled, none of them held; ``CheckFailed`` if the robot is held."""
     pair.rates, pair.allowed = rates, allowed
     for _ in range(ATTEMPTS):
@@ -371,5 +387,5 @@ def _is_held(frames: Sequence[Frame]) -> bool:
     return any(frame.cmd.held for frame in frames)
 
 
-def _named(allowed: Allowed) -> str:
+def _named(allowed: Permits) -> str:
     return " and ".join(name for name, is_on in zip(("forward", "reverse", "turn"), allowed, strict=True) if is_on)

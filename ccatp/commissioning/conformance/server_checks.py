@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal, NoReturn
 from pydantic import Field
 
 from ccatp.commissioning.conformance.harness import (
-    ALL,
     STILL,
     Body,
     CheckContext,
@@ -33,6 +32,7 @@ from ccatp.commissioning.conformance.harness import (
     steady,
     whole_samples,
 )
+from ccatp.core import ALL_MOTION
 from ccatp.links.robot_codec import MAX_LINE_BYTES, encode, join_mac
 from ccatp.links.robot_messages import PROTOCOL, Drive, Role
 from ccatp.survey.checks import PATIENCE_S, MirrorCheck
@@ -199,7 +199,7 @@ def _refused_is_harmless(pair: ControllerAndMonitor) -> str:
             require(pair.context.is_closed(connection), "a refused client's connection stays open")
             refused += 1
             pair.run_frames(3)
-            pair.rates, pair.allowed = STILL, ALL
+            pair.rates, pair.allowed = STILL, ALL_MOTION
     pair.run_frames(5)
     pair.settle()
     limit_s = facts.ttl_s - 2 * facts.frame_s

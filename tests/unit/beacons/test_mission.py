@@ -31,7 +31,7 @@ from ccatp.survey.events import DONE, HELD, VISITING, Abort, Fault, Pause, Resum
 from ccatp.survey.state import HoldState
 from tests.support.scenario import radio_config_of
 
-FREE = Verdict(0, 0.0, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+FREE = Verdict.normal(0, 0.0)
 DENIED = RADIO_SILENT.found("radio", 8.0, 7.0).verdict(0, 0.0, EventCode.NORMAL)
 
 

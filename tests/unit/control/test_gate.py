@@ -11,13 +11,13 @@ from msgspec.structs import replace
 
 from ccatp.config.models import LimitsConfig
 from ccatp.control.gate import Denial, DriveGate, FanGate, Purpose
-from ccatp.core import NO_CAUSE, EventCode, Twist, Verdict, twist_of, wheel_rates
+from ccatp.core import EventCode, Twist, Verdict, twist_of, wheel_rates
 from ccatp.daemon.survey_runner import GateLog
 from ccatp.survey.events import AMONG_BEACONS, PURPOSES, MissionState
 from tests.support.scenario import config_of
 
 LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.8, alpha_max_rad_s2=2.0)
-FREE = Verdict(0, 0.0, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+FREE = Verdict.normal(0, 0.0)
 R, L, DT = 0.03, 0.15, 0.01
 VERDICT_S, FRAME_S = 0.15, 0.12
 ZERO = 0.0, 0.0

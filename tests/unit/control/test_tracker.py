@@ -13,11 +13,11 @@ from ccatp.config.models import Config
 from ccatp.control.gate import DriveGate, Purpose
 from ccatp.control.tracker import LegLine, LegMotion, LegPhase, LegTracker, LegView, line_rate
 from ccatp.control.wheel_motion import SentDrives
-from ccatp.core import NO_CAUSE, EventCode, Twist, Verdict, difference, twist_of, wheel_rates
+from ccatp.core import Twist, Verdict, difference, twist_of, wheel_rates
 from ccatp.survey.planning.search import bang_bang_time
 
 DT = 0.01
-FREE = Verdict(0, 0.0, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+FREE = Verdict.normal(0, 0.0)
 NONE, NEAR_M = (0.0, 0.0), 0.12
 Pose = tuple[float, float, float]
 

@@ -11,7 +11,7 @@ import pytest
 import structlog
 import zmq
 
-from ccatp.core import NO_CAUSE, EventCode, Verdict
+from ccatp.core import Verdict
 from ccatp.daemon.main_loop import STANDS_REPEAT_S, STANDS_REPORT_S, StandstillReport
 from ccatp.links import bus as bus_module
 from ccatp.links.bus import BATCH_FRAMES, Publisher, Telemetry, VerdictSubscriber
@@ -107,7 +107,7 @@ class Bus:
 
     def judge(self, *seqs: int) -> None:
         for seq in seqs:
-            verdict = Verdict(seq, FRAME_S * seq, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+            verdict = Verdict.normal(seq, FRAME_S * seq)
             self._publisher.send("verdict", verdict)
 
     def in_force(self, seq: int, *, is_lockstep: bool = True) -> int | None:

@@ -8,7 +8,7 @@ import pytest
 
 from ccatp.conditions import TABLE, Action, Clear, Condition, Group, Motion
 from ccatp.config.models import Config
-from ccatp.core import NO_CAUSE, EmergencyKind, EventCode, Severity, Verdict
+from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.alarms import active_cause
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety import edge_detector, emergency_latch
@@ -22,7 +22,7 @@ from tests.support.scenario import config_of, mirror_of
 from tests.unit.test_danger import FRONT
 from tests.unit.test_danger import Story as EdgeStory
 
-FREE = Verdict(0, 0.0, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
+FREE = Verdict.normal(0, 0.0)
 LIMITS = {"health.pause_limit_s": 3.0, "health.hold_limit_s": 7.0, "health.lifted_limit_s": 5.0}
 HEALTH = config_of("fyst-m2", **{name.replace(".", "__"): value for name, value in LIMITS.items()}).health
 FOUND = [row for row in DANGER if row.severity and row.group is not Group.BEACONS]  # by a monitor

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from ccatp.conditions import Condition, MonitorFinding
 from ccatp.config.models import Config
-from ccatp.core import NO_CAUSE, Cause, EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
+from ccatp.core import Cause, EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
@@ -20,7 +20,7 @@ from tests.support.rows import DANGER
 from tests.support.scenario import world_of
 
 CODES = {
-    "normal": Verdict(7, 0.07, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True),
+    "normal": Verdict.normal(7, 0.07),
     "at an edge": Verdict(7, 0.07, EventCode.NEAR_EDGE, Cause("rim_ahead"), "front_left", 0.1, 0.0, False, True, False),
     "an emergency": Verdict(
         7, 0.07, EventCode.ABORTED, Cause("emergency", {"kind": "fire"}), "emergency:fire", 1.0, 0.0, True, True, True
