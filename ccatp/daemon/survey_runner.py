@@ -436,7 +436,7 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         """Remind operators periodically, and return to base before the battery is too low for that."""
         mission, timer, pose = self.mission, self._fault_timer, self.localizer.deck_pose
         is_localized = not (mission.state.is_lost or self.localizer.is_frozen)
-        home_s = home_time_s(self.mirror.base_pose, self.cfg.limits, pose.x_m, pose.y_m) if is_localized else None
+        home_s = home_time_s(self.mirror, self.cfg.limits, pose.x_m, pose.y_m) if is_localized else None
         action = timer.watch(self._clock.t_s, sensors.soc, home_s)
         if action is FaultAction.REMIND:
             held_s = timer.held_s(self._clock.t_s)

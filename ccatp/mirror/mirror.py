@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import groupby
-from math import atan2, cos, pi, sin
+from math import atan2, cos, hypot, pi, sin
 from typing import Literal
 
 import numpy as np
@@ -12,6 +12,10 @@ from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, PointId, Vector
 from ccatp.mirror.layout import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, PanelGrid
 from ccatp.mirror.rim import build_rim
 from ccatp.mirror.surface import Axes, Surface, UnknownPanelError, build_surface
+
+# Length of the way home over the straight line. Planned ways follow rows, columns and the steps of the rim, and are up
+# to 1.47 times as long on the mirrors of the telescope.
+_HOME_DETOUR = 1.5
 
 
 class Mirror:
@@ -58,6 +62,10 @@ class Mirror:
             PanelId(base.row, base.col), base.x_mm * 1e-3, base.y_mm * 1e-3, base.heading_rad
         )
         self.base_pose = self.deck_pose(self.base_panel_pose)
+
+    def home_way_m(self, x_m: float, y_m: float) -> float:
+        """Upper estimate of the length of the way from a place on the deck to base, without planning a route."""
+        return _HOME_DETOUR * hypot(x_m - self.base_pose.x_m, y_m - self.base_pose.y_m)
 
     def deck_from_mirror(self, p: Vector3) -> Vector3:
         """Deck coordinates of a point given in the mirror frame, m; also the inverse."""

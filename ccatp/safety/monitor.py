@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import hypot, inf
+from math import inf
 
 from ccatp import conditions
 from ccatp.conditions import SAMPLE_RATES, MonitorFinding
@@ -231,8 +231,7 @@ class HealthMonitor:
         self._opened = (opened[0], opened[1], opened[2], opened[3])
         x, y = estimate.x_m, estimate.y_m
         self._seams.step(t_s, (x, y, estimate.heading_rad), estimate.sigma_m)
-        base = self._mirror.base_pose
-        self._home_m = hypot(x - base.x_m, y - base.y_m)
+        self._home_m = self._mirror.home_way_m(x, y)
 
     def _found(self, t_s: float) -> list[MonitorFinding]:
         found = []

@@ -256,8 +256,6 @@ class SeamMonitor:
 
 # A fan command is in force at the latest two link delays after it was sent.
 _FIRST_COMMAND_S = 1.0
-# Length of the way home over the straight distance, because it follows rows and columns of panels.
-_DETOUR = 1.6
 REPORTED = {
     "imu": conditions.IMU_REPORTED,
     "encoder_left": conditions.ENCODER_REPORTED,
@@ -326,10 +324,10 @@ class BatteryMonitor:
         self._low, self._reported = Since(), Since()
 
     def step(self, t_s: float, soc: float, is_reported: bool, home_m: float) -> None:
-        """Judge a frame; ``soc`` from 0 to 1."""
+        """Judge a frame; ``soc`` from 0 to 1, ``home_m``: length of the way home."""
         cfg = self._cfg
         least = cfg.battery_reserve
-        least += cfg.battery_margin * _DETOUR * home_m / cfg.slow_speed_m_s / cfg.battery_life_s
+        least += cfg.battery_margin * home_m / cfg.slow_speed_m_s / cfg.battery_life_s
         if self._low.lasts(t_s, soc < least) >= cfg.battery_time_s:
             self.finding = conditions.BATTERY_LOW.found("soc", soc, least)
         if self._reported.lasts(t_s, is_reported) >= cfg.battery_time_s:

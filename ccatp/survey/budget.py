@@ -12,15 +12,14 @@ from ccatp.survey.planning.search import leg_time, turn_time
 # Points of a panel to measure when there is no time for all: corners and centre, or three that determine a plane.
 LEVELS = (frozenset((1, 3, 5, 7, 9)), frozenset((1, 3, 8)))
 _TURN_RAD = 0.5 * pi  # assumed before every leg
-_DETOUR = 1.5  # length of the way home, around the rim's steps, over the straight line
 _DOCKING_S = 15.0  # escape from the rim, turns on the way, the turn at base
 _FIRST_S = 60.0  # planned time after which the ratio of real to planned time is known
 _LARGEST_PACE = 5.0
 
 
-def home_time_s(base: DeckPose, limits: LimitsConfig, x_m: float, y_m: float) -> float:
-    """Upper estimate of the time from a place on the deck to ``base``, s, without planning a route."""
-    length_m = _DETOUR * hypot(x_m - base.x_m, y_m - base.y_m)
+def home_time_s(mirror: Mirror, limits: LimitsConfig, x_m: float, y_m: float) -> float:
+    """Upper estimate of the time from a place on the deck to base, s, without planning a route."""
+    length_m = mirror.home_way_m(x_m, y_m)
     stops = 1 + int(length_m)
     return leg_time(length_m, limits) + stops * turn_time(_TURN_RAD, limits) + _DOCKING_S
 
@@ -41,10 +40,10 @@ class TimeBudget:
         self.budget_s = budget_s
         self._limits, self._measuring_s = limits, measuring_time_s
         self._place_of: Callable[[PointId], tuple[float, float]] = mirror.point_on_deck
-        self._base = mirror.base_pose
+        self._mirror = mirror
 
     def _home_s(self, point: PointId) -> float:
-        return home_time_s(self._base, self._limits, *self._place_of(point))
+        return home_time_s(self._mirror, self._limits, *self._place_of(point))
 
     def tour_s(self, x_m: float, y_m: float, points: Sequence[PointId]) -> float:
         """An estimate of the time to drive to the points in their order and to measure them."""

@@ -477,7 +477,7 @@ def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(
             clear_m = [mirror.rim.segment_clearance_m(*a, *b) for a, b in itertools.pairwise([(x, y), *ends])]
             is_valid = clear_m[0] >= own_m and all(c >= least_m for c in clear_m[1:])
             takes_s = path_time(stops, start, cfg.limits, mirror, 0.0)
-            invalid += not (is_valid and takes_s <= home_time_s(base, cfg.limits, x, y))
+            invalid += not (is_valid and takes_s <= home_time_s(mirror, cfg.limits, x, y))
     measured("O9", invalid)
     assert (count, invalid) == (expected, 0)
 

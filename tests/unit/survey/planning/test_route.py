@@ -56,6 +56,17 @@ def test_whole_surveys_fit_into_the_hour(world: Any) -> None:
     assert straight_s < route.remaining_s(0) < 1.045 * straight_s
 
 
+def test_ways_home_are_not_longer_than_their_estimate(world: Any) -> None:
+    """Battery, budget and the report of an unattended fault use it."""
+    mirror, planner = world.mirror, RoutePlanner(world.mirror, world.cfg)
+    points = [point for panel in mirror.panels for point in mirror.point_ids(panel)]
+    for point in points[::29]:
+        x_m, y_m = mirror.point_on_deck(point)
+        places = [(x_m, y_m), *((stop.x_m, stop.y_m) for stop in planner.home(DeckPose(x_m, y_m, 1.0)))]
+        way_m = sum(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(places))
+        assert way_m <= mirror.home_way_m(x_m, y_m) + 0.1, point  # at base the robot turns
+
+
 def test_start_beyond_the_rim(thesis: Any) -> None:
     with pytest.raises(OutsideMirrorError, match=r"start \(9\.000, 0\.000\) m is 5\.\d+ m beyond the rim of thesis-m1"):
         RoutePlanner(thesis.mirror, thesis.cfg).route(DeckPose(9.0, 0.0, 0.0), [])
