@@ -17,7 +17,6 @@ from ccatp.estimation.fixes import FixRefused
 from ccatp.estimation.wheel_coast import CoastedMotion
 from ccatp.filters.base import Filter, FilterError, FilterModel, Innovation
 from ccatp.filters.metrics import nees, rms
-from ccatp.filters.smoother import ROUNDING, Smoothed, Smoother
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
@@ -26,6 +25,7 @@ from ccatp.records.summary import distribution
 from ccatp.records.timeline import common_rows, rows_of
 from ccatp.report.html import render
 from ccatp.studies.results import value_at
+from ccatp.studies.smoother import ROUNDING, Smoothed, Smoother
 
 # Largest number of calls that can be undone. A late fix goes back some seconds, which are a few hundred calls.
 REACH = 2000

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from ccatp.core import FloatArray
 from ccatp.filters import FILTERS
-from ccatp.filters.smoother import Smoother
+from ccatp.studies.smoother import Smoother
 
 BOTH = pytest.mark.parametrize("name", ["ekf", "ukf"])
 DT_S, SEEDS, STEPS = 0.1, 50, 60

@@ -11,8 +11,8 @@ from ccatp.estimation.state_model import Affine
 from ccatp.filters import FILTERS
 from ccatp.filters.base import FilterDiverged, FilterShapeError
 from ccatp.filters.ekf_slam import BlockError, EkfSlam, columns_of
-from ccatp.filters.smoother import Smoother
 from ccatp.studies.bench_cases import survey_problem
+from ccatp.studies.smoother import Smoother
 from tests.oracle.exact_filter import ExactFilter
 
 Step = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]

@@ -1,4 +1,4 @@
-"""What filters and smoother promise and refuse: shapes, symmetry, the empty update, the innovation, models."""
+"""What filters promise and refuse: shapes, symmetry, the empty update, the innovation, models."""
 
 import tracemalloc
 from typing import Any, Literal
@@ -12,7 +12,6 @@ from ccatp.core import FloatArray
 from ccatp.filters import FILTERS
 from ccatp.filters.base import Filter, FilterDiverged, FilterShapeError
 from ccatp.filters.kalman import KalmanFilter
-from ccatp.filters.smoother import Smoother, SmootherEmpty
 
 EYE = np.eye(2)
 
@@ -285,7 +284,7 @@ def test_symmetric_positive_and_any_order_at_any_ratio(seed: int, ratio: float, 
     np.testing.assert_allclose(found[0][1] / np.outer(sigma, sigma), found[1][1] / np.outer(sigma, sigma), atol=1e-13)
 
 
-# -- models, and what they may not be; the smoother --------------------------------------------------------------------
+# -- models, and what they may not be ---------------------------------------------------------------------------------
 
 BOTH = pytest.mark.parametrize("name", ["ekf", "ukf"])
 
@@ -352,30 +351,3 @@ def test_no_measurement_of_a_model(name: str) -> None:
     filter_ = build(name)
     innovation = filter_.update(np.empty(0), Bent(0), np.empty(0))
     assert (innovation.nis, innovation.size) == (0.0, 0)
-
-
-def test_smoother_refuses() -> None:
-    smoother, kf = Smoother(2), KalmanFilter(np.zeros(2), EYE)
-    with pytest.raises(SmootherEmpty, match="step 0 of 0 recorded"):
-        smoother.smooth(kf)
-    with pytest.raises(FilterShapeError, match=r"predicted has shape \(3,\), wanted \(2,\)"):
-        smoother.record(np.zeros(2), EYE, EYE, np.zeros(3), EYE)
-    smoother.predict(kf, EYE, EYE)
-    assert len(smoother) == 1
-    with pytest.raises(SmootherEmpty, match="step 1 of 1 recorded"):
-        smoother.smooth(kf, first=1)
-    smoother.record(np.full(2, np.nan), EYE, EYE, np.zeros(2), EYE)
-    with pytest.raises(FilterDiverged, match="smoothed states are not finite among 2 steps"):
-        smoother.smooth(kf)
-
-
-def test_smoother_in_blocks_and_in_part() -> None:
-    kf, smoother = KalmanFilter(np.zeros(1), np.ones((1, 1))), Smoother(1, np.float32)
-    one = np.ones((1, 1))
-    for i in range(5000):  # more than a block
-        smoother.predict(kf, one, 0.01 * one)
-        kf.update(np.array([np.sin(0.01 * i)]), one, np.ones(1))
-    whole, part = smoother.smooth(kf), smoother.smooth(kf, first=4990)
-    assert whole.means.shape == (5001, 1)
-    np.testing.assert_array_equal(whole.means[4990:], part.means)
-    np.testing.assert_array_equal(whole.covariances[4990:], part.covariances)

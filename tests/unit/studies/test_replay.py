@@ -10,7 +10,6 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, ImuSample, WheelSample
 from ccatp.filters import FILTERS
-from ccatp.filters.smoother import Smoother
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import FixMessage, Rest
 from ccatp.localizer import build_localizer
@@ -31,6 +30,7 @@ from ccatp.studies.replay import (
     replay,
     table_lines,
 )
+from ccatp.studies.smoother import Smoother
 
 FRAME_S = 0.01
 STILL_FRAMES = 60  # longer than a rest takes to be seen
