@@ -21,7 +21,8 @@ from ccatp.estimation.localizer_base import (
     WheelReadings,
     unwrapped,
 )
-from ccatp.estimation.odometry import PosePredictor, Preintegrator, WheelAngle
+from ccatp.estimation.odometry import Preintegrator, WheelAngle
+from ccatp.estimation.pose_predictor import PosePredictor
 from ccatp.estimation.rest import NoiseFloor, ZeroVelocityDetector
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import STATES, V, W

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.core import FloatArray, ImuSample
-from ccatp.estimation.odometry import PosePredictor, PreintegratedMotion, Preintegrator, Slope, WheelAngle
+from ccatp.estimation.odometry import PreintegratedMotion, Preintegrator, Slope, WheelAngle
+from ccatp.estimation.pose_predictor import PosePredictor
 from ccatp.estimation.state_model import BG, KG, PL, PR, PSI, STATES, SurveyMotion, W, X, Y
 from tests.unit.estimation.drive import config
 from tests.unit.estimation.test_state_model import LEVEL, shares, slopes, states
