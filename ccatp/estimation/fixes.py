@@ -7,7 +7,7 @@ import numpy as np
 
 from ccatp.core import Fix, FloatArray
 from ccatp.estimation.odometry import Slope, axes_on
-from ccatp.estimation.state_model import ANGLES, POSE, PSI, SPEEDS, STATES, TILT, TX, TY, V, W, X, Y
+from ccatp.estimation.state_model import ANGLES, POSE, POSITION, PSI, SPEEDS, STATES, TILT, TX, TY, V, W, X, Y
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
 
@@ -68,7 +68,7 @@ def fix_row(z: FloatArray, mean: FloatArray, slope: Slope, late_s: float) -> tup
     """Residual (2,) and H (2, n) of a deck position ``z`` (2,), m, for a state ``late_s`` later; V and W constant."""
     H = np.zeros((2, STATES))
     H[0, X] = H[1, Y] = H[0, TX] = H[1, TY] = 1.0
-    residual = z - mean[:2] - mean[TILT]
+    residual = z - mean[POSITION] - mean[TILT]
     if late_s == 0.0:
         return residual, H
     v, w = float(mean[V]), float(mean[W])
@@ -97,15 +97,14 @@ def relocated(
     """
     x, P = mean.copy(), covariance.copy()
     heading_rad2 = float(P[PSI, PSI]) + heading_variance_rad2
-    new = POSE + ANGLES + TILT + (SPEEDS if is_lost else [])
-    P[new, :] = 0.0
-    P[:, new] = 0.0
-    P[:2, :2], P[PSI, PSI] = variance, heading_rad2
+    for states in (POSE, ANGLES, TILT, *([SPEEDS] if is_lost else [])):
+        P[states, :] = P[:, states] = 0.0
+    P[POSITION, POSITION], P[PSI, PSI] = variance, heading_rad2
     P[[X, Y, TX, TY], [X, Y, TX, TY]] += tilt_variance_m2
     P[[X, Y, TX, TY], [TX, TY, X, Y]] -= tilt_variance_m2
-    x[:2] += residual + x[TILT]
-    x[ANGLES + TILT] = 0.0
+    x[POSITION] += residual + x[TILT]
+    x[ANGLES] = x[TILT] = 0.0
     if is_lost:
         x[SPEEDS] = 0.0
-        P[SPEEDS, SPEEDS] = _UNKNOWN_SPEEDS
+        P[SPEEDS, SPEEDS] = np.diag(_UNKNOWN_SPEEDS)
     return x, P

@@ -25,7 +25,7 @@ from ccatp.estimation.odometry import Preintegrator, WheelAngle
 from ccatp.estimation.pose_predictor import PosePredictor
 from ccatp.estimation.rest import NoiseFloor, ZeroVelocityDetector
 from ccatp.estimation.state_filter import SurveyFilter
-from ccatp.estimation.state_model import STATES, V, W
+from ccatp.estimation.state_model import POSE, POSITION, STATES, V, W
 from ccatp.estimation.wheel_coast import CoastedMotion, WheelInput
 from ccatp.filters.base import FilterDiverged, Innovation
 from ccatp.mirror.layout import Panel
@@ -84,7 +84,7 @@ class FullStateLocalizer(LocalizerBase):
     @property
     def pose_covariance(self) -> FloatArray:
         """Covariance of (x, y, heading), deck frame, shape (3, 3), at the last step of the filter."""
-        return self._filter.covariance[:3, :3]
+        return self._filter.covariance[POSE, POSE]
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
@@ -280,7 +280,7 @@ class FullStateLocalizer(LocalizerBase):
         self._locate()
 
     def _worst_sigma_m(self) -> float:
-        (a, b), (_, d) = self._filter.covariance[:2, :2].tolist()
+        (a, b), (_, d) = self._filter.covariance[POSITION, POSITION].tolist()
         return sqrt(max(0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b), 0.0))
 
     def _predict_pose(self, half_s: float) -> None:

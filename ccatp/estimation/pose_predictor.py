@@ -4,6 +4,7 @@ from math import cos, sin, sqrt
 
 from ccatp.core import FloatArray
 from ccatp.estimation.odometry import Slope
+from ccatp.estimation.state_model import BG, CT, KG, KL, PSI, SL, SR, A, C, V, W, X, Y
 
 
 class PosePredictor:
@@ -23,23 +24,22 @@ class PosePredictor:
 
     def begin(self, mean: FloatArray, slope: Slope, half_s: float, turn_creep_share: float = 1.0) -> None:
         """Begin after a step of the filter of length 2 ``half_s``, whose mean speed belongs to the middle."""
-        state: list[float] = mean.tolist()
-        x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c, *_, ct = state  # as ``state_model``
-        self.x_m, self.y_m, self.heading_rad = x, y, psi
-        self._a = a
-        self.v_m_s, self.omega_rad_s = v + a * half_s, w
-        self._per_scale = 1.0 / (1.0 + scale)
-        self._right_m, self._left_m = self._radius_m * (1.0 - s_r), self._radius_m * (1.0 - s_l)
-        self._per_base = 1.0 / (self._base_m * (1.0 + k_l))
+        q: list[float] = mean.tolist()
+        self.x_m, self.y_m, self.heading_rad = q[X], q[Y], q[PSI]
+        self._a, self._bias = q[A], q[BG]
+        self.v_m_s, self.omega_rad_s = q[V] + q[A] * half_s, q[W]
+        self._per_scale = 1.0 / (1.0 + q[KG])
+        self._right_m, self._left_m = self._radius_m * (1.0 - q[SR]), self._radius_m * (1.0 - q[SL])
+        self._per_base = 1.0 / (self._base_m * (1.0 + q[KL]))
         fx, fy, fxx, fxy, _, gx, gy = slope
         s2 = 1.0 + fx * fx
         s = sqrt(s2)
         norm = sqrt(s2 + fy * fy)
         self._along, self._ex, self._ey = 1.0 / s, -fx * fy / (norm * s), s / norm
         self._k1, self._k2 = fy * fxx / (s2 * norm), fy * fxy / (s2 * norm)
-        self.creep_x, self.creep_y = c * gx, c * gy
-        ct *= turn_creep_share
-        self._turn_creep_x, self._turn_creep_y = ct * gx, ct * gy
+        self.creep_x, self.creep_y = q[C] * gx, q[C] * gy
+        turn_creep = q[CT] * turn_creep_share
+        self._turn_creep_x, self._turn_creep_y = turn_creep * gx, turn_creep * gy
 
     def trust(self, angle_variance_rad2: float, rate_variance_rad2_s2: float, dt_s: float) -> None:
         """Set the noise of one wheel's travel in a frame of ``dt_s``, and of a gyroscope sample."""

@@ -248,7 +248,7 @@ class SurveyFilter:
 
         def step() -> None:
             if edge.is_new:
-                self._renew([edge.offset], full.edge_sigma_m)
+                self._renew(edge.offset, full.edge_sigma_m)
             mean, P = filter_.mean, filter_.covariance
             residual, H, variance = self._seams.line(edge, transition, t_s, mean, self.slope())
             spread = variance + float(H[0].dot(P).dot(H[0]))
@@ -259,12 +259,11 @@ class SurveyFilter:
 
         self.journal.do(step)
 
-    def _renew(self, states: list[int], sigma: float) -> None:
+    def _renew(self, states: int | slice, sigma: float) -> None:
         """Reset states for another edge or panel: standard deviation ``sigma``, no correlations."""
-        F, Q = np.eye(sm.STATES), np.zeros((sm.STATES, sm.STATES))
-        F[states, states] = 0.0
-        Q[states, states] = sigma * sigma
-        self._filter.predict(F, Q)
+        kept, variances = np.ones(sm.STATES), np.zeros(sm.STATES)
+        kept[states], variances[states] = 0.0, sigma * sigma
+        self._filter.predict(np.diag(kept), np.diag(variances))
 
     # -- fixes --------------------------------------------------------------------------------------------------------
 
@@ -317,8 +316,9 @@ class SurveyFilter:
         if again:
             self._legs = SlipPrior(self._full)
             first, P_first = self._first(DeckPose(*x[sm.POSE].tolist()))
-            P_first[:2, :2], P_first[sm.PSI, sm.PSI] = P[:2, :2], P[sm.PSI, sm.PSI]
-            P_first[sm.TILT, :2], P_first[:2, sm.TILT] = P[sm.TILT, :2], P[:2, sm.TILT]
+            place, tilt = sm.POSITION, sm.TILT
+            P_first[place, place], P_first[sm.PSI, sm.PSI] = P[place, place], P[sm.PSI, sm.PSI]
+            P_first[tilt, place], P_first[place, tilt] = P[tilt, place], P[place, tilt]
             x, P = first, P_first
         self._filter.reset(x, P)
         self._keep_calibration()

@@ -42,14 +42,10 @@ left wheel since the last rest, rad. E0, E1: displacement from the map of the tw
 TY: displacement of the puck by the tilt of the panel under the robot, deck frame, m.
 """
 STATES = 20
-POSE, SPEEDS, SLIPS, ANGLES, EDGES, TILT = [X, Y, PSI], [V, A, W], [SR, SL, C, CT], [PR, PL], [E0, E1], [TX, TY]
-CALIBRATION = [BG, KG, BA, SR, SL, KL, C, CT]
+POSITION, POSE, SPEEDS = slice(X, Y + 1), slice(X, PSI + 1), slice(V, W + 1)
+ANGLES, EDGES, TILT = slice(PR, PL + 1), slice(E0, E1 + 1), slice(TX, TY + 1)
+SLIPS, CALIBRATION = [SR, SL, C, CT], [BG, KG, BA, SR, SL, KL, C, CT]  # not adjacent
 _NOISY = np.array([A, W, SR, SL, C, CT])  # states whose noise enters at the beginning of a step
-_MOVED = np.array([X, Y, PSI, V, PR, PL])  # states that a step changes, in the order of `SurveyMotion.at`
-# Entries of the motion's Jacobian besides the identity, in the order of `SurveyMotion.at`, which sets all in one call.
-_COLUMNS: dict[int, tuple[int, ...]] = dict.fromkeys((X, Y, PSI), (PSI, V, A, W, C, CT))
-_COLUMNS |= {V: (A,), PR: (V, A, W, SR, KL), PL: (V, A, W, SL, KL)}
-_ENTRIES = np.array([row * STATES + column for row, columns in _COLUMNS.items() for column in columns])
 
 
 class SurveyMotion:
@@ -82,11 +78,11 @@ class SurveyMotion:
         if x is self._of:  # computed already, for the noise
             return self._x, self._F
         self._of = x
-        state: list[float] = x.tolist()
-        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_, ct = state
+        q: list[float] = x.tolist()
+        psi, c, ct = q[PSI], q[C], q[CT]
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
-        v += a * dt
-        d, turn, share = v * dt, w * dt, self._share
+        v = q[V] + q[A] * dt
+        d, turn, share = v * dt, q[W] * dt, self._share
         s2 = 1.0 + fx * fx
         s, norm = sqrt(s2), sqrt(s2 + fy * fy)
         ex, ey = -fx * fy / (norm * s), s / norm
@@ -97,47 +93,55 @@ class SurveyMotion:
         down = c * way + ct * angle
         dx, dy = d * hx + down * gx, d * hy + down * gy
         k1, k2 = fy * fxx / (s2 * norm), fy * fxy / (s2 * norm)
-        per_r, per_l = 1.0 / (self._radius_m * (1.0 - s_r)), 1.0 / (self._radius_m * (1.0 - s_l))
+        grip_r, grip_l = 1.0 - q[SR], 1.0 - q[SL]  # parts of a wheel's travel that the body follows
+        per_r, per_l = 1.0 / (self._radius_m * grip_r), 1.0 / (self._radius_m * grip_l)
         half = self._half_base_m
-        side = turn * (1.0 + kl) * half
+        side = turn * (1.0 + q[KL]) * half
         right, left = d + side, d - side
-        self._x[:] = x
-        self._x[_MOVED] = x_m + dx, y_m + dy, psi + turn - k1 * dx - k2 * dy, v, p_r + right * per_r, p_l + left * per_l
+        after = self._x
+        after[:] = x
+        after[X], after[Y] = q[X] + dx, q[Y] + dy
+        after[PSI] = psi + turn - k1 * dx - k2 * dy
+        after[V] = v
+        after[PR], after[PL] = q[PR] + right * per_r, q[PL] + left * per_l
         sign, turn_down = c if d >= 0.0 else -c, dt * share * (ct if turn >= 0.0 else -ct)
         xv, yv = dt * (hx + sign * gx), dt * (hy + sign * gy)
         x_psi, y_psi, x_c, y_c, x_ct, y_ct = d * lx, d * ly, way * gx, way * gy, angle * gx, angle * gy
         xw, yw = 0.5 * dt * x_psi + turn_down * gx, 0.5 * dt * y_psi + turn_down * gy
-        psi_v, turn_dt = -k1 * xv - k2 * yv, dt * (1.0 + kl) * half
-        self._F.reshape(-1)[_ENTRIES] = (
-            *(x_psi, xv, dt * xv, xw, x_c, x_ct),
-            *(y_psi, yv, dt * yv, yw, y_c, y_ct),
-            *(1.0 - k1 * x_psi - k2 * y_psi, psi_v, dt * psi_v),
-            *(dt - k1 * xw - k2 * yw, -k1 * x_c - k2 * y_c, -k1 * x_ct - k2 * y_ct, dt),
-            *(dt * per_r, dt * dt * per_r, turn_dt * per_r, right * per_r / (1.0 - s_r), turn * half * per_r),
-            *(dt * per_l, dt * dt * per_l, -turn_dt * per_l, left * per_l / (1.0 - s_l), -turn * half * per_l),
-        )
-        return self._x, self._F
+        psi_v, turn_dt = -k1 * xv - k2 * yv, dt * (1.0 + q[KL]) * half
+        F = self._F  # its other entries are those of the identity
+        F[X, PSI], F[X, V], F[X, A], F[X, W], F[X, C], F[X, CT] = x_psi, xv, dt * xv, xw, x_c, x_ct
+        F[Y, PSI], F[Y, V], F[Y, A], F[Y, W], F[Y, C], F[Y, CT] = y_psi, yv, dt * yv, yw, y_c, y_ct
+        F[PSI, PSI] = 1.0 - k1 * x_psi - k2 * y_psi
+        F[PSI, V], F[PSI, A], F[PSI, W] = psi_v, dt * psi_v, dt - k1 * xw - k2 * yw
+        F[PSI, C], F[PSI, CT] = -k1 * x_c - k2 * y_c, -k1 * x_ct - k2 * y_ct
+        F[V, A] = dt
+        F[PR, V], F[PR, A], F[PR, W] = dt * per_r, dt * dt * per_r, turn_dt * per_r
+        F[PL, V], F[PL, A], F[PL, W] = dt * per_l, dt * dt * per_l, -turn_dt * per_l
+        F[PR, SR], F[PR, KL] = right * per_r / grip_r, turn * half * per_r
+        F[PL, SL], F[PL, KL] = left * per_l / grip_l, -turn * half * per_l
+        return after, F
 
     def through(self, points: FloatArray) -> FloatArray:
         """The states (k, n) after the step, row by row."""
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
-        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_, ct = points.T
-        v = v + a * dt
-        d, turn = v * dt, w * dt
+        q = points.T
+        v = q[V] + q[A] * dt
+        d, turn = v * dt, q[W] * dt
         s2 = 1.0 + fx * fx
         s, norm = sqrt(s2), sqrt(s2 + fy * fy)
-        middle = psi + 0.5 * turn
+        middle = q[PSI] + 0.5 * turn
         cosine, sine = np.cos(middle), np.sin(middle)
-        way = c * np.abs(d) + self._share * ct * np.abs(turn)
+        way = q[C] * np.abs(d) + self._share * q[CT] * np.abs(turn)
         dx = d * (cosine / s - sine * (fx * fy / (norm * s))) + way * gx
         dy = d * (sine * (s / norm)) + way * gy
-        side = turn * (1.0 + kl) * self._half_base_m
+        side = turn * (1.0 + q[KL]) * self._half_base_m
         after = points.copy()
-        after[:, X], after[:, Y] = x_m + dx, y_m + dy
-        after[:, PSI] = psi + turn - fy * (fxx * dx + fxy * dy) / (s2 * norm)
+        after[:, X], after[:, Y] = q[X] + dx, q[Y] + dy
+        after[:, PSI] = q[PSI] + turn - fy * (fxx * dx + fxy * dy) / (s2 * norm)
         after[:, V] = v
-        after[:, PR] = p_r + (d + side) / (self._radius_m * (1.0 - s_r))
-        after[:, PL] = p_l + (d - side) / (self._radius_m * (1.0 - s_l))
+        after[:, PR] = q[PR] + (d + side) / (self._radius_m * (1.0 - q[SR]))
+        after[:, PL] = q[PL] + (d - side) / (self._radius_m * (1.0 - q[SL]))
         return after
 
     def noise(self, x: FloatArray, impulses: FloatArray, drift: FloatArray) -> FloatArray:
