@@ -1,11 +1,20 @@
-"""The interface of the filters: the ``Filter`` protocol, the innovation of an update, the errors."""
+"""What the filters share: the ``Filter`` protocol, the innovation of an update, errors, checks and square roots."""
 
 from typing import Protocol
 
 import msgspec
 import numpy as np
+from scipy.linalg.blas import ddot
+from scipy.linalg.lapack import dpotrf, dpstrf
 
 from ccatp.core import FloatArray
+
+ASYMMETRY = 1e-9
+"""Largest relative asymmetry that counts as rounding of the caller's arithmetic."""
+HUGE = 1e200
+"""Sums of squares beyond it count as not finite, so that no product of smaller numbers overflows."""
+NEGATIVITY = 1e-9
+"""Largest negative part of a covariance, relative to its largest entry, that counts as rounding."""
 
 
 class FilterError(Exception):
@@ -28,21 +37,17 @@ class FilterDiverged(FilterError):
 class Innovation(msgspec.Struct, frozen=True, gc=False):
     """Residual and consistency of an update.
 
-    ``nis`` is nu^T (H P H^T + R)^-1 nu of all rows; chi-squared with m degrees of freedom if the filter is consistent.
+    ``residual``: nu = z - H x with the predicted state, shape (m,). ``nis``: nu^T (H P H^T + R)^-1 nu; chi-squared with
+    m degrees of freedom if the filter is consistent.
     """
 
-    rows: list[float]  # a third of the cost of an array, which is seldom needed
+    residual: FloatArray
     nis: float
-
-    @property
-    def residual(self) -> FloatArray:
-        """Nu = z - H x with the predicted state, shape (m,)."""
-        return np.array(self.rows, dtype=np.float64)
 
     @property
     def size(self) -> int:
         """m, the number of measurement rows."""
-        return len(self.rows)
+        return self.residual.size
 
 
 class FilterModel(Protocol):
@@ -80,14 +85,15 @@ class Filter(Protocol):
     def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """Advance the state: x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or the same with a nonlinear f.
 
-        F and Q have shape (n, n). Raises ``FilterShapeError`` and ``FilterDiverged`` (not finite).
+        F and Q have shape (n, n). Raises ``FilterShapeError``, and ``FilterDiverged``: not finite, or P not positive
+        semidefinite, because Q is not.
         """
 
     def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> Innovation:
         """Condition the state on z = H x + noise (thesis eqs 2.7 to 2.10), or on z = h(x) + noise.
 
         z (m,), m = 0 has no effect; H (m, n) or a model; R variances (m,) or covariance (m, m). Raises
-        ``FilterShapeError``, and ``FilterDiverged``: posterior not finite, P or R not positive definite.
+        ``FilterShapeError``, and ``FilterDiverged``: posterior not finite, or R not positive definite.
         """
 
     def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
@@ -97,15 +103,34 @@ class Filter(Protocol):
         """
 
 
-def check_rows(z: FloatArray, H: FloatArray, R: FloatArray, states: int) -> None:
-    """Raises ``FilterShapeError`` where z (m,), H (m, n), R (m,) or (m, m) do not fit each other or n ``states``."""
+def check_transition(x: FloatArray | None, F: FloatArray, Q: FloatArray, states: int) -> None:
+    """Raises ``FilterShapeError`` where f(x) (n,) of a model, F (n, n) or Q (n, n) do not fit n ``states``."""
+    wanted = (states, states)
+    if x is not None and x.shape != (states,):
+        raise FilterShapeError("f(x)", x.shape, f"({states},)")
+    if F.shape != wanted:
+        raise FilterShapeError("F" if x is None else "df/dx", F.shape, str(wanted))
+    if Q.shape != wanted:
+        raise FilterShapeError("Q", Q.shape, str(wanted))
+
+
+def check_rows(z: FloatArray, expected: FloatArray | None, H: FloatArray, R: FloatArray, states: int) -> None:
+    """Raises ``FilterShapeError`` where z (m,), h(x) (m,) of a model, H (m, n), R (m,) or (m, m) do not fit."""
     m = z.size
     if z.ndim != 1:
         raise FilterShapeError("z", z.shape, "(m,)")
+    if expected is not None and expected.shape != (m,):
+        raise FilterShapeError("z", z.shape, f"{expected.shape} of h(x)")
     if H.shape != (m, states):
         raise FilterShapeError("H", H.shape, f"({m}, {states})")
     if R.shape not in ((m,), (m, m)):
         raise FilterShapeError("R", R.shape, f"({m},) or ({m}, {m})")
+
+
+def is_finite(a: FloatArray) -> bool:
+    """Whether the sum of squares is below ``HUGE``."""
+    entries = a.ravel("K")
+    return bool(ddot(entries, entries) < HUGE)
 
 
 def checked_gaussian(mean: FloatArray, covariance: FloatArray, shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
@@ -128,9 +153,41 @@ def checked_gaussian(mean: FloatArray, covariance: FloatArray, shape: tuple[int,
     return mean, 0.5 * (covariance + covariance.T)
 
 
-ASYMMETRY = 1e-9
-"""Largest relative asymmetry that counts as rounding of the caller's arithmetic."""
-HUGE = 1e200
-"""Sums of squares beyond it count as not finite, so that no product of smaller numbers overflows."""
-NEGATIVITY = 1e-9
-"""Largest negative eigenvalue, relative to the largest entry, that counts as rounding."""
+def square_root(P: FloatArray) -> FloatArray:
+    """L (n, n) with L L^T = P; raises ``FilterDiverged`` if P (n, n) is not positive semidefinite.
+
+    L is the lower Cholesky factor. If P is singular it is that of P with permuted rows and columns: the factorisation
+    takes the largest remaining variance first, and ends when none is left.
+    """
+    L: FloatArray
+    L, info = dpotrf(P, 1)
+    if info == 0:
+        return L
+    if not np.isfinite(P).all():
+        raise FilterDiverged("covariance is not finite")
+    factor, pivots, rank, _ = dpstrf(np.tril(P), 0.0, 1)
+    factor[:, rank:] = 0.0
+    L[pivots - 1] = np.tril(factor)
+    if np.abs(P - L.dot(L.T)).max() > NEGATIVITY * np.abs(P).max():
+        least = float(np.linalg.eigvalsh(P)[0])
+        raise FilterDiverged(f"covariance is not positive semidefinite: least eigenvalue {least:.3g}")
+    return L
+
+
+def beside_noise_root(HL: FloatArray, R: FloatArray) -> FloatArray:
+    """[H L, N], shape (m, k + m), of H L (m, k) and R = N N^T, variances (m,) or (m, m); N is lower triangular.
+
+    Raises ``FilterDiverged`` if R is not positive definite.
+    """
+    m, k = HL.shape
+    rows = np.zeros((m, k + m))
+    rows[:, :k] = HL
+    if R.ndim == 1:
+        if not min(R.tolist()) > 0.0:
+            raise FilterDiverged(f"R is not positive definite: least variance {min(R.tolist()):.3g}")
+        rows.flat[k :: k + m + 1] = np.sqrt(R)
+        return rows
+    rows[:, k:], info = dpotrf(R, 1)
+    if info != 0:
+        raise FilterDiverged("R is not positive definite")
+    return rows

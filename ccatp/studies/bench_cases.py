@@ -54,8 +54,7 @@ class Race(NamedTuple):
 def races(cfg: Config) -> Iterator[Race]:
     """Steps of filters, of range SLAM (a prediction and a scalar update) and of multilateration."""
     # kf: the inertial unit, with none, one and ten samples of each wheel. ekf: the models as matrices. In the last case
-    # wheel angles are as exact as the localizer assumes for a rate encoder: an update has two subtractions, as most
-    # updates of a survey have.
+    # wheel angles are as exact as the localizer assumes for a rate encoder, as in most updates of a survey.
     problems = [("kf", thesis_problem(cfg, m), "") for m in (2, 4, 22)]
     problems += [("ekf", linearised_problem(cfg, m), "") for m in (4, 6, 23)]
     problems += [("ekf", linearised_problem(cfg, 4, WheelAngle().variance_rad2()), ", angles to 1e-5 rad")]

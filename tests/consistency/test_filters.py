@@ -176,7 +176,7 @@ class Linear:
 
 
 @BOTH
-@pytest.mark.parametrize("count", [1, 2, 5, 6, 8, 23])  # rows are filled up to a multiple of four
+@pytest.mark.parametrize("count", [1, 2, 5, 6, 8, 23])
 def test_a_model_that_is_linear_is_the_matrix(name: str, count: int) -> None:
     A, rng = np.array([[1.0, 0.3], [-0.2, 0.9]]), np.random.default_rng(count)
     H, z, R = rng.normal(size=(count, 2)), rng.normal(size=count), rng.uniform(0.2, 0.3, count)

@@ -145,8 +145,8 @@ def test_a_lost_pose(name: str) -> None:
     check(name, np.zeros(4), np.diag([1e4, 1e2, 1e4, 1e4]), [step], vector_R=True)
 
 
-RATIOS = pytest.mark.parametrize("ratio", [1e2, 2.9e3, 3.1e3, 1e6, 8.9e6, 9.1e6, 1e9, 1e12])
-"""Variance of the prior to that of the noise: a first fix, a lost pose, a very small R; and around the thresholds."""
+RATIOS = pytest.mark.parametrize("ratio", [1.0, 1e2, 1e4, 1e6, 1e7, 1e8, 1e9, 1e10, 1e12, 1e15, 1e18])
+"""Variance of the prior to that of the noise: a first fix, a lost pose, a very small R."""
 ROWS = pytest.mark.parametrize("rows", [[1], [3], [4], [1, 2], [0, 3, 4], [1, 2, 0, 3], [1, 1, 2, 4, 4, 0, 1]])
 
 
@@ -179,11 +179,13 @@ def test_the_posterior_is_right_in_its_own_sigmas(name: str, ratio: float, rows:
     filter_.update(z, H, R)
     exact.update(z, H, R)
     sigma = np.sqrt(exact.covariance.diagonal())
-    # 1e-16 of the prior is sqrt(ratio) times as much of the posterior; 2e-12 is lost just below the threshold.
+    # 1e-16 of the prior is sqrt(ratio) times as much of the posterior.
     tolerance = 5e-12 + 5e-16 * np.sqrt(ratio)
     assert np.all(np.abs(filter_.mean - exact.mean) <= tolerance * sigma)
     assert np.all(np.abs(filter_.covariance - exact.covariance) <= tolerance * np.outer(sigma, sigma))
-    assert np.linalg.eigvalsh(filter_.covariance)[0] > 0.0
+    least = np.linalg.eigvalsh(filter_.covariance / np.outer(sigma, sigma))[0]
+    # One reading of two states correlates them: at 1e18 the determinant of P is smaller than the rounding of P.
+    assert least > (0.0 if ratio < 1e16 else -1e-15)
 
 
 @pytest.mark.parametrize("ratio", [1e2, 1e5, 1e12])
