@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.sim.robot import BeaconRobot, build_beacon_robot
 from ccatp.config.files import read_key
 from ccatp.config.load import load_onboard_config
 from ccatp.config.models import Config
@@ -28,7 +29,6 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.onboard.robot import OnboardRobot
 from ccatp.onboard.server import TcpRobotServer
 from ccatp.onboard.sessions import ServerLog
-from ccatp.sim.beacon_robot import BeaconRobot, build_beacon_robot
 from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.fault_proxy import FaultProxy, LinkFaults

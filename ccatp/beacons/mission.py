@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.conditions import MISSION_TOO_LONG, Action
-from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello

@@ -6,6 +6,7 @@ from enum import StrEnum
 from math import asin, cos, dist, hypot, inf, pi, sin, tau
 from typing import NamedTuple
 
+from ccatp.beacons.config.models import AvoidanceConfig, FollowConfig, RadioConfig
 from ccatp.beacons.steering import (
     HALT,
     BearingToPoint,
@@ -16,7 +17,6 @@ from ccatp.beacons.steering import (
     WaypointSteering,
     aim_at,
 )
-from ccatp.config.beacon_models import AvoidanceConfig, FollowConfig, RadioConfig
 from ccatp.core import bearing, wrap_pi
 
 _NEAREST_M = 0.02  # lower limit of a distance, below which the direction is meaningless

@@ -5,7 +5,7 @@ from itertools import pairwise, product
 from math import cos, hypot, pi
 from typing import NamedTuple
 
-from ccatp.config.beacon_models import FuzzyConfig, RadioControlConfig, VehicleConfig
+from ccatp.beacons.config.models import FuzzyConfig, RadioControlConfig, VehicleConfig
 from ccatp.control.tracker import Pid, PidState
 from ccatp.core import bearing, wrap_pi
 

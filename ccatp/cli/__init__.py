@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import click
 
 import ccatp
-from ccatp.cli import config, onboard, operate, prepare, radio, recording, report, run, runs, sim, study
+from ccatp.beacons.cli import radio
+from ccatp.cli import config, onboard, operate, prepare, recording, report, run, runs, sim, study
 from ccatp.cli.common import CommandGroup, example, run_command_line
 
 SECTIONS = {

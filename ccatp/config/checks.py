@@ -10,7 +10,7 @@ from pathlib import PurePath
 
 from pydantic import BaseModel
 
-from ccatp.config.beacon_models import BeaconRobotConfig, CricketConfig, FuzzyConfig, RadioConfig
+from ccatp.beacons.config.models import BeaconRobotConfig, CricketConfig, FuzzyConfig, RadioConfig
 from ccatp.config.messages import ConfigProblem, Key, choice_hint, slip_hint
 from ccatp.config.models import Config, DashboardConfig, MirrorConfig, RobotConfig
 from ccatp.config.onboard_models import OnboardConfig, OnboardRobotConfig

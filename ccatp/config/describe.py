@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.files import read_toml
 from ccatp.config.load import DEFAULT_FILE, available, load_config, load_radio_config
 from ccatp.config.models import Config

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from ccatp.config.beacon_models import RadioConfig, RecordingsConfig
+from ccatp.beacons.config.models import RadioConfig, RecordingsConfig
 from ccatp.config.checks import check_config, check_onboard_config, check_radio_config, is_file_name
 from ccatp.config.files import read_toml
 from ccatp.config.messages import (

@@ -14,7 +14,7 @@ from enum import Enum
 from pathlib import Path
 from typing import NamedTuple, TypeVar, cast
 
-from ccatp.config.beacon_models import RadioConfig, SimBeaconRobotConfig
+from ccatp.beacons.config.models import RadioConfig, SimBeaconRobotConfig
 from ccatp.config.models import Config, DashboardConfig, ProcessesConfig, SimEtalonConfig, SimRobotConfig
 from ccatp.config.package import child_environment
 from ccatp.daemon.process import SUPERVISOR_PID, listen_at, read_config, run_dir_in

@@ -11,7 +11,7 @@ import numpy as np
 import zmq
 
 import ccatp
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, PanelId, PointId, unreliable_points
@@ -48,7 +48,7 @@ from ccatp.records.timeline import iter_places, read_timeline
 from ccatp.report.foxglove import Views, recorded_schemas
 
 if TYPE_CHECKING:
-    from ccatp.records.beacon_summary import BeaconSummary
+    from ccatp.beacons.records.summary import BeaconSummary
 
 RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.message in (Timing, Heartbeat))
 FINISH_TIMEOUT_S = 5.0
@@ -83,7 +83,7 @@ class Collector:
         self._view: RunView | None = None
         if isinstance(cfg, RadioConfig):
             # Imported late: a survey does not need it, and its libraries are large.
-            from ccatp.records import beacon_summary  # noqa: PLC0415
+            from ccatp.beacons.records import summary as beacon_summary  # noqa: PLC0415
 
             what = {"system": cfg.system, "seed": str(cfg.run.seed)}
             self._record = beacon_summary.BeaconSummary(cfg, is_sim)

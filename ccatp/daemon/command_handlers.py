@@ -18,8 +18,8 @@ from ccatp.links.rpc import Router, ZapHandler
 from ccatp.safety.emergency_latch import answer_observatory
 
 if TYPE_CHECKING:
+    from ccatp.beacons.safety.rules import BeaconSafetyRules
     from ccatp.danger import DangerMonitor
-    from ccatp.safety.beacons import BeaconSafetyRules
 
 KEY_FILE, CLIENTS_FILE = "observatory.key_file", "observatory.clients_file"
 # Only the daemon's own user can use the unix socket, and this user could also stop the daemon.

@@ -17,8 +17,10 @@ from typing import Any
 import structlog
 import zmq
 
+from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.links.messages import decode_beacon_frame
+from ccatp.beacons.safety.rules import BeaconSafetyRules
 from ccatp.conditions import text_of
-from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.files import read_text, sync_folder
 from ccatp.config.models import Config
 from ccatp.core import NO_CAUSE, Cause, EmergencyKind, EventCode, Severity, Verdict
@@ -28,14 +30,12 @@ from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import RobotLoop
 from ccatp.danger import DangerMonitor
 from ccatp.errors import ExitStatus
-from ccatp.links.beacon_messages import decode_beacon_frame
 from ccatp.links.bus import EstimateSubscriber
 from ccatp.links.frame_answers import PermitRule
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import DangerEvent, EstimateMessage
 from ccatp.mirror.mirror import build_mirror
-from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.safety.emergency_latch import Emergency, EmergencyLatch
 
 Judge = Callable[[Sensors, bytes, EstimateMessage | None], Verdict]

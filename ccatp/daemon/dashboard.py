@@ -17,7 +17,7 @@ from typing import Any
 import structlog
 import zmq
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.daemon.child_processes import open_page_socket, token_query
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
@@ -64,7 +64,7 @@ async def serve_page(
     past: RunStateView
     if isinstance(cfg, RadioConfig):
         # Imported late: a survey does not need it, and its libraries are large.
-        from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground  # noqa: PLC0415
+        from ccatp.beacons.report.dashboard.view import BeaconView, beacon_ground  # noqa: PLC0415
 
         view, wants = BeaconView(cfg, is_sim=is_sim, run_dir=run_dir), BEACONS
         past = BeaconView(cfg, is_sim=is_sim)

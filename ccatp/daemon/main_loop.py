@@ -10,6 +10,7 @@ from typing import Any
 import zmq
 from msgspec.structs import replace
 
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.conditions import (
     FRAME_LATE,
     FRAMES_OLD,
@@ -21,7 +22,6 @@ from ccatp.conditions import (
     Owner,
     text_of,
 )
-from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import MissionClock, Severity, Verdict
 from ccatp.daemon.alarms import ActiveCause, AlarmList, active_cause
 from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionRunner, TimedFrame
@@ -503,7 +503,7 @@ def open_runner(args: ProcessArgs) -> AbstractContextManager[Callable[[MainLoop]
     """THE table of missions: opens the database, yields a factory. Imports only the configured one, to save time."""
     cfg = args.config
     if isinstance(cfg, RadioConfig):
-        from ccatp.daemon.beacon_runner import open_beacons  # noqa: PLC0415
+        from ccatp.beacons.daemon.runner import open_beacons  # noqa: PLC0415
 
         return open_beacons(cfg, args)
     from ccatp.daemon.survey_runner import open_survey  # noqa: PLC0415

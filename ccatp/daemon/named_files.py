@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.files import read_key
 from ccatp.config.models import Config
 from ccatp.daemon.command_handlers import CLIENTS_FILE, KEY_FILE

@@ -23,7 +23,7 @@ import structlog
 import uvloop
 import zmq
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.files import keep_traceback, read_input
 from ccatp.config.load import is_radio_file, load_config, load_radio_config
 from ccatp.config.models import Config, ProcessesConfig

@@ -12,7 +12,7 @@ from pathlib import Path, PurePath
 from typing import Any
 from uuid import uuid4
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.files import read_input, read_text, write_durably
 from ccatp.config.load import load_config
 from ccatp.config.models import Config

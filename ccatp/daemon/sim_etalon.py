@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import Vector3
 from ccatp.daemon.child_processes import listen

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import structlog
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.daemon.child_processes import listen
 from ccatp.daemon.process import FAULTS_FILE, Endpoints, open_log, processes_of, run_until_stopped, start_process

@@ -17,7 +17,7 @@ from typing import Any
 
 import zmq
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.files import read_toml, write_durably
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config

@@ -14,8 +14,8 @@ import structlog
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.conditions import TABLE, danger_text
-from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import Severity
 from ccatp.errors import ExitStatus, printable

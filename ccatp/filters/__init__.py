@@ -1,4 +1,4 @@
-"""Gaussian filters on arrays: Kalman, extended, unscented, EKF-SLAM. ``FILTERS``: by ``run.filter``."""
+"""Gaussian filters on arrays: Kalman, extended, unscented. ``FILTERS``: by ``run.filter``."""
 
 from collections.abc import Callable
 

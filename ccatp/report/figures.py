@@ -9,10 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from ccatp.beacons.report import record as beacon_record
+from ccatp.beacons.report.record import BeaconRecord
 from ccatp.core import FloatArray
 from ccatp.links.topics import BeaconEllipse
-from ccatp.report import beacon_record, plots
-from ccatp.report.beacon_record import BeaconRecord
+from ccatp.report import plots
 from ccatp.report.findings import KINDS, ErrorSeries, TimeBreakdown
 from ccatp.report.plots import BAD, INK, PX_PER_IN, QUIET, SERIES, add_legend, ellipse_outline, envelope, is_wide
 from ccatp.report.record import WITHIN_MM

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from ccatp.beacons.report import record as beacon_record
+from ccatp.beacons.report.record import BeaconRecord
 from ccatp.config.files import write_file
 from ccatp.filters.metrics import consistency
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
 from ccatp.records.run_reader import RunReadError
-from ccatp.report import beacon_record, figures
+from ccatp.report import figures
 from ccatp.report.alignment import worst_corner
-from ccatp.report.beacon_record import BeaconRecord
 from ccatp.report.findings import Findings, Grade, coverage_of, findings_of, observation_of
 from ccatp.report.html import MICRO, Draw, events_of, page_figures, render, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure

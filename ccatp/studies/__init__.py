@@ -21,27 +21,42 @@ Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
 
 # Name: module and the name in it of a Study or an Analysis; title.
 STUDIES = {
-    "thesis": ("thesis_study:STUDY", "the thesis's own simulation again, under several readings"),
-    "filters": ("survey_studies:FILTERS", "filters in four worlds, over whole missions"),
-    "time": ("survey_studies:TIME", "order, speed and measuring time against the hour"),
-    "sensitivity": ("survey_studies:SENSITIVITY", "what each disturbance of a hard world costs"),
-    "ablation": ("survey_studies:ABLATION", "what each technique gives, one off at a time"),
-    "physics": ("physics_study:PHYSICS", "a rigid body on both mirrors: tyre, friction, thrust"),
-    "bodies": ("physics_study:BODIES", "a rigid body with drawn tyres, contacts and accelerometer"),
-    "stops": ("physics_study:STOPS", "a rigid body at the rim and on command: overrun by speed"),
-    "slides": ("physics_study:SLIDES", "a rigid body whose friction falls: when that is found"),
-    "danger": ("danger_study:STUDY", "false edges and overrun of two edge rules"),
-    "faults": ("faults_study:STUDY", "whole missions with random faults: falls, completion"),
-    "cricket": ("cricket_study:STUDY", "self-mapping of motes: the published figures, better ways"),
-    "mote-sizes": ("cricket_study:run_sizes", "time of self-mapping against the number of motes"),
-    "mote-navigation": ("mote_navigation:STUDY", "a robot guided by motes that mapped themselves"),
-    "radio-signals": ("radio_studies:RADIO_SIGNALS", "levels and bearings of ZigBee radios, beside 2017"),
-    "radio-slam": ("radio_studies:RADIO_SLAM", "EKF-SLAM among ZigBee radios: rooms, slip, shadowing"),
-    "radio-cases": ("radio_studies:RADIO_CASES", "cases I to III of 2017 side by side with ours"),
-    "radio-follow": ("radio_studies:RADIO_FOLLOW", "a moving radio followed, beside 2018"),
-    "recordings": ("recordings:RECORDINGS", "estimators on recorded runs among beacons, from several starts"),
-    "damage": ("damage:STUDY", "the filter on damaged recordings: recovered, reported or wrong"),
-    "loops": ("loops:run", "Bode plots, margins and root loci of the controllers"),
+    "thesis": ("ccatp.studies.thesis_study:STUDY", "the thesis's own simulation again, under several readings"),
+    "filters": ("ccatp.studies.survey_studies:FILTERS", "filters in four worlds, over whole missions"),
+    "time": ("ccatp.studies.survey_studies:TIME", "order, speed and measuring time against the hour"),
+    "sensitivity": ("ccatp.studies.survey_studies:SENSITIVITY", "what each disturbance of a hard world costs"),
+    "ablation": ("ccatp.studies.survey_studies:ABLATION", "what each technique gives, one off at a time"),
+    "physics": ("ccatp.studies.physics_study:PHYSICS", "a rigid body on both mirrors: tyre, friction, thrust"),
+    "bodies": ("ccatp.studies.physics_study:BODIES", "a rigid body with drawn tyres, contacts and accelerometer"),
+    "stops": ("ccatp.studies.physics_study:STOPS", "a rigid body at the rim and on command: overrun by speed"),
+    "slides": ("ccatp.studies.physics_study:SLIDES", "a rigid body whose friction falls: when that is found"),
+    "danger": ("ccatp.studies.danger_study:STUDY", "false edges and overrun of two edge rules"),
+    "faults": ("ccatp.studies.faults_study:STUDY", "whole missions with random faults: falls, completion"),
+    "cricket": (
+        "ccatp.beacons.studies.cricket_study:STUDY",
+        "self-mapping of motes: the published figures, better ways",
+    ),
+    "mote-sizes": ("ccatp.beacons.studies.cricket_study:run_sizes", "time of self-mapping against the number of motes"),
+    "mote-navigation": (
+        "ccatp.beacons.studies.mote_navigation:STUDY",
+        "a robot guided by motes that mapped themselves",
+    ),
+    "radio-signals": (
+        "ccatp.beacons.studies.radio_studies:RADIO_SIGNALS",
+        "levels and bearings of ZigBee radios, beside 2017",
+    ),
+    "radio-slam": (
+        "ccatp.beacons.studies.radio_studies:RADIO_SLAM",
+        "EKF-SLAM among ZigBee radios: rooms, slip, shadowing",
+    ),
+    "radio-cases": ("ccatp.beacons.studies.radio_studies:RADIO_CASES", "cases I to III of 2017 side by side with ours"),
+    "radio-follow": ("ccatp.beacons.studies.radio_studies:RADIO_FOLLOW", "a moving radio followed, beside 2018"),
+    "recordings": (
+        "ccatp.beacons.studies.recordings:RECORDINGS",
+        "estimators on recorded runs among beacons, from several starts",
+    ),
+    "damage": ("ccatp.beacons.studies.damage:STUDY", "the filter on damaged recordings: recovered, reported or wrong"),
+    "loops": ("ccatp.studies.loops:run", "Bode plots, margins and root loci of the controllers"),
 }
 
 
@@ -55,7 +70,7 @@ def find_study(name: str) -> "Study | Analysis":
         raise CampaignError(f"no study {name!r}; {hint}")
     place, title = STUDIES[name]
     module, _, attribute = place.partition(":")
-    found: Study | Analysis = getattr(import_module(f"ccatp.studies.{module}"), attribute)
+    found: Study | Analysis = getattr(import_module(module), attribute)
     return replace(found, name=name, title=title) if isinstance(found, Study) else found
 
 

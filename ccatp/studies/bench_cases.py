@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from ccatp.beacons.filters.ekf_slam import EkfSlam, columns_of
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, FloatArray
 from ccatp.estimation import state_model as sm
 from ccatp.estimation.odometry import Terrain, WheelAngle
 from ccatp.filters import FILTERS
-from ccatp.filters.ekf_slam import EkfSlam, columns_of
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
 from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.multilateration import multilaterate

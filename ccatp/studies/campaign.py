@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 import ccatp
-from ccatp.config.beacon_models import RadioConfig, RecordingsConfig
+from ccatp.beacons.config.models import RadioConfig, RecordingsConfig
 from ccatp.config.models import Config
 from ccatp.errors import ExitStatus, UsageError
 

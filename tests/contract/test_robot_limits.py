@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from ccatp.beacons.sim.robot import build_beacon_robot
 from ccatp.commissioning.conformance.harness import CheckFailed, Facts, parse
 from ccatp.commissioning.probes import probe_robot
 from ccatp.config.load import load_config, load_onboard_config, load_radio_config
@@ -25,7 +26,6 @@ from ccatp.errors import ConfigError
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_link import ImpossibleRobot
 from ccatp.links.robot_messages import Hello, Joined, Sensors
-from ccatp.sim.beacon_robot import build_beacon_robot
 from tests.faults.linking import Measured
 from tests.support.daemon import HELLO
 from tests.support.scenario import boot, config_of, mirror_of, radio_config_of

@@ -46,7 +46,7 @@ def test_what_holds_the_robot_has_its_row_and_no_row_is_without_use() -> None:
 
 
 PLACES = {  # where the owner of a condition finds it
-    Owner.DANGER: ("danger.py", "safety"),
+    Owner.DANGER: ("danger.py", "safety", "beacons/safety"),
     Owner.LOCALIZER: ("localizer.py", "estimation"),
     Owner.MISSION: ("survey", "control", "beacons", "daemon"),
     Owner.FIXES: ("survey", "daemon"),

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ccatp.beacons.filters.ekf_slam import BlockError, EkfSlam, columns_of
 from ccatp.config.load import load_config
 from ccatp.core import FloatArray
 from ccatp.estimation.state_model import Affine
 from ccatp.filters import FILTERS
 from ccatp.filters.base import FilterDiverged, FilterShapeError
-from ccatp.filters.ekf_slam import BlockError, EkfSlam, columns_of
 from ccatp.studies.bench_cases import survey_problem
 from ccatp.studies.smoother import Smoother
 from tests.oracle.exact_filter import ExactFilter

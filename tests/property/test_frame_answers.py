@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import ccatp
+from ccatp.beacons.links.messages import BeaconFrame
+from ccatp.beacons.safety.rules import BeaconSafetyRules
 from ccatp.core import NO_CAUSE, EventCode, Verdict
 from ccatp.daemon.danger_loop import build_safety_monitor
 from ccatp.danger import DangerMonitor
-from ccatp.links.beacon_messages import BeaconFrame
 from ccatp.links.frame_answers import AWAY_SLACK_S, DriveRule, FrameId, JudgedFrame, PermitRule, is_restart, permitted
 from ccatp.links.robot_messages import CommandEcho, Sensors
-from ccatp.safety.beacons import BeaconSafetyRules
 from tests.support.scenario import config_of, radio_config_of
 
 NOTHING, ALL = (False, False, False), (True, True, True)

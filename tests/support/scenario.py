@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.load import available, load_config, load_radio_config
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, motor_robot, survey_robot

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
+from ccatp.beacons.config.models import RecordingConfig, SlamFilterConfig
 from ccatp.beacons.slam.motion import DifferentialDrive
-from ccatp.config.beacon_models import RecordingConfig, SlamFilterConfig
 from ccatp.config.load import load_recordings_config
 
 _NOTHING: dict[str, object] = {

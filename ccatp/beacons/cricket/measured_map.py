@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc
 
+from ccatp.beacons.config.models import CricketConfig
 from ccatp.beacons.cricket.map_fit import (
     MapFitSettings,
     MapModel,
@@ -31,7 +32,6 @@ from ccatp.beacons.cricket.range_network import (
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
 from ccatp.beacons.cricket.self_mapping import MoteMapper, run_phase_two
 from ccatp.beacons.slam.track_review import next_range
-from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, best_motion
 

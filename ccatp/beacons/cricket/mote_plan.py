@@ -5,8 +5,8 @@ from itertools import combinations, pairwise, product
 
 import numpy as np
 
+from ccatp.beacons.config.models import CricketConfig
 from ccatp.beacons.cricket.range_network import RigidBody
-from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 
 Pairs = tuple[tuple[int, int], ...]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ccatp.config.beacon_models import CricketConfig
+from ccatp.beacons.config.models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.filters.metrics import RigidMotion, best_motion

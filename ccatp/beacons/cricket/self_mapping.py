@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
+from ccatp.beacons.config.models import BatchConfig, CricketConfig, PhaseTwoConfig
 from ccatp.beacons.cricket.mote_plan import MotePlan
 from ccatp.beacons.cricket.range_network import MappingError, coordinates_of
 from ccatp.beacons.cricket.trilateration import FirstMap
-from ccatp.config.beacon_models import BatchConfig, CricketConfig, PhaseTwoConfig
+from ccatp.beacons.filters.ekf_slam import EkfSlam, Update
 from ccatp.core import FloatArray
-from ccatp.filters.ekf_slam import EkfSlam, Update
 
 _STRAIGHT = 0.01  # share of the variance of a range below which the second-order term is negligible
 _CURVED = 2  # joint updates of all pairs: the second-order term depends on the errors of the map

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
+from ccatp.beacons.config.models import FixedLagConfig, RadioNoiseConfig, RecordingConfig, SlamFilterConfig
+from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.beacons.slam.batch_problem import BEACON, RSSI_REFERENCE, SHARED, ArrowSystem, BatchProblem, BatchState
 from ccatp.beacons.slam.beacon_slam import BeaconSlam
 from ccatp.beacons.slam.causal import beyond_priors, follow
@@ -19,9 +21,7 @@ from ccatp.beacons.slam.evaluation import aligned_beacons
 from ccatp.beacons.slam.landmark_init import LEAST
 from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun, Steps
-from ccatp.config.beacon_models import FixedLagConfig, RadioNoiseConfig, RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
-from ccatp.filters.ekf_slam import columns_of
 from ccatp.filters.metrics import best_motion
 
 LEAST_DAMPING = 1e-9

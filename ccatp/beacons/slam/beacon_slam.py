@@ -7,6 +7,8 @@ from math import log, sqrt
 import msgspec
 import numpy as np
 
+from ccatp.beacons.config.models import RecordingConfig, SlamFilterConfig
+from ccatp.beacons.filters.ekf_slam import BlockError, Columns, EkfSlam, RowUpdate, columns_of
 from ccatp.beacons.slam.beacon_map import (
     FURTHEST,
     HEADING,
@@ -45,9 +47,7 @@ from ccatp.beacons.slam.motion import (
     estimated,
 )
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
-from ccatp.config.beacon_models import RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.ekf_slam import BlockError, Columns, EkfSlam, RowUpdate, columns_of
 
 DELAY = "odometry_delay_s"
 PLACE = 2  # x_m, y_m

@@ -8,13 +8,13 @@ from math import inf, pi, sqrt
 
 import numpy as np
 
+from ccatp.beacons.config.models import FixedLagConfig, RecordingConfig, SlamFilterConfig
+from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.beacons.slam.beacon_map import HEADING
 from ccatp.beacons.slam.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
 from ccatp.beacons.slam.motion import POSE, Increment
 from ccatp.beacons.slam.recording import BeaconFix, Calibrated, DelayedPath, EstimatedPath, Reading, RecordedRun, Steps
-from ccatp.config.beacon_models import FixedLagConfig, RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
-from ccatp.filters.ekf_slam import columns_of
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported
 UNCHANGED = 0.999  # share of the prior's standard deviation above which a value counts as not determined by readings

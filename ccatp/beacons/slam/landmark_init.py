@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
 from ccatp.beacons.slam.measurement_models import MeasurementRow, scalars_of
 from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
 
 # From kind, pose, calibration and states of the beacon to a row.
 RowOf = Callable[[str, list[float], list[float], list[float]], MeasurementRow]

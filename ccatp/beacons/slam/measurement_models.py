@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from ccatp.beacons.config.models import PriorsConfig, RadioNoiseConfig
 from ccatp.beacons.slam.level_fix import grid_points
 from ccatp.beacons.slam.motion import estimated
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import BeaconId, Reading
-from ccatp.config.beacon_models import PriorsConfig, RadioNoiseConfig
 from ccatp.core import FloatArray
 
 DB = 10.0 / math.log(10.0)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ccatp.config.beacon_models import (
+from ccatp.beacons.config.models import (
     OdometryConfig,
     OdometryNoiseConfig,
     PriorsConfig,

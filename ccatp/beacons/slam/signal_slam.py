@@ -8,15 +8,15 @@ from math import atan2, cos, exp, hypot, log, pi, sin, sqrt, tau
 import numpy as np
 from scipy.special import chdtri
 
+from ccatp.beacons.config.models import RadioConfig, ScanConfig, SlamFilterConfig
+from ccatp.beacons.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
 from ccatp.beacons.slam.beacon_slam import PLACE, BeaconInnovation, BeaconSlam
 from ccatp.beacons.slam.landmark_init import PendingLandmark, StackedRows
 from ccatp.beacons.slam.measurement_models import BearingModel, LevelModel, MeasurementModels, ShadowingMap
 from ccatp.beacons.slam.motion import POSE, Odometry, SlippingVehicle, VehiclePose
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
-from ccatp.config.beacon_models import RadioConfig, ScanConfig, SlamFilterConfig
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
 
 _ITERATIONS = 4
 _NEAREST_M = 0.02  # smallest distance, so that derivatives of the distance exist

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.config.models import RadioNoiseConfig
 from ccatp.beacons.slam.measurement_models import range_variance
 from ccatp.beacons.slam.recording import Calibrated, EstimatedPath, RecordedRun, antenna_path
-from ccatp.config.beacon_models import RadioNoiseConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import rigid_modes
 

@@ -7,12 +7,12 @@ import pytest
 from numpy.random import default_rng
 from scipy.stats import chi2
 
+from ccatp.beacons.config.models import FuzzyConfig, RadioConfig
 from ccatp.beacons.pilot import BackOff, BeaconPilot, FollowState, PilotState, TargetSight
+from ccatp.beacons.sim.radio import SimDriveCommand, TruePose, clearance_m, seen_m
+from ccatp.beacons.sim.radio_world import TrueVehicle
 from ccatp.beacons.steering import HALT, FuzzyGapError, Point, Sugeno
-from ccatp.config.beacon_models import FuzzyConfig, RadioConfig
-from ccatp.sim.radio import SimDriveCommand, TruePose, clearance_m, seen_m
-from ccatp.sim.radio_world import TrueVehicle
-from ccatp.studies.mote_navigation import BeaconSilResult, rehearse_beacons
+from ccatp.beacons.studies.mote_navigation import BeaconSilResult, rehearse_beacons
 from tests.support.scenario import radio_config_of
 from tests.unit.beacons.test_mission import target_distances
 

@@ -9,24 +9,24 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.links.messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.beacons.mission import RULES, BeaconMission, WaypointArrival, check_beacon_robot, permitted, wheel_rates
 from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, PoseBelief, SelfMap, packets_of
+from ccatp.beacons.records.store import BeaconStore, BeaconStoreError
+from ccatp.beacons.records.summary import BeaconSummary
+from ccatp.beacons.safety.rules import BeaconSafetyRules, ObstacleBuffer
+from ccatp.beacons.sim.radio_world import RadioWorld
+from ccatp.beacons.sim.robot import BeaconRobot
 from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
-from ccatp.beacons.store import BeaconStore, BeaconStoreError
+from ccatp.beacons.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
 from ccatp.conditions import ENCODERS_STALE, RADIO_SILENT, text_of
-from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import NO_CAUSE, Cause, EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
-from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
-from ccatp.records.beacon_summary import BeaconSummary
-from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
-from ccatp.sim.beacon_robot import BeaconRobot
-from ccatp.sim.radio_world import RadioWorld
-from ccatp.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
 from ccatp.survey.events import DONE, HELD, VISITING, Abort, Fault, Pause, Resume, StopHere
 from ccatp.survey.state import HoldState
 from tests.support.scenario import radio_config_of

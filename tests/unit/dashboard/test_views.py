@@ -9,8 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.mission import MODES
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.beacons.report.dashboard.view import BeaconView, beacon_ground
 from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, EventCode, Fix, Measured, PanelId, PanelPose, PointId, Severity, Verdict
@@ -34,7 +35,6 @@ from ccatp.records.recorder import Recorder
 from ccatp.records.store import StoredPoint, StoredSurvey
 from ccatp.report.dashboard.access import CommandRefusal, check_command, host_refusal, make_token, page_tokens
 from ccatp.report.dashboard.app import STATIC
-from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
 from ccatp.report.dashboard.history import replay
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.survey_view import ground as survey_ground

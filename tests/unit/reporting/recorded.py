@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
+from ccatp.beacons.config.models import RadioConfig
 from ccatp.conditions import text_of
-from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config, load_config, load_radio_config
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, Measured, PanelId, PointId

@@ -4,9 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.cli import main
-from ccatp.records.run_reader import RunReadError
-from ccatp.report.beacon_record import (
+from ccatp.beacons.report.record import (
     beacon_rows,
     pose_errors_m,
     pose_nees,
@@ -14,6 +12,8 @@ from ccatp.report.beacon_record import (
     readings_of,
     waypoint_rows,
 )
+from ccatp.cli import main
+from ccatp.records.run_reader import RunReadError
 from ccatp.report.plots import NARROW, PX_PER_IN, WIDE
 from ccatp.report.run_page import beacon_data, beacon_drawings, beacon_page
 from tests.support.command import answered, printed

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from ccatp.beacons.datasets.tables import RadioDataError
+from ccatp.beacons.filters.ekf_slam import BlockError
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.filters.ekf_slam import BlockError
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 
 SPEEDS_M_S = (0.05, 0.1)

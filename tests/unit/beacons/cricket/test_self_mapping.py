@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.models import PhaseTwoConfig
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.mote_plan import MotePlan, network_plan
 from ccatp.beacons.cricket.range_network import (
@@ -18,10 +19,9 @@ from ccatp.beacons.cricket.range_network import (
 )
 from ccatp.beacons.cricket.self_mapping import MoteMapper, complete_stands, conditioned, run_phase_two
 from ccatp.beacons.cricket.trilateration import DegenerateStep, FirstMap, map_by_plan
-from ccatp.config.beacon_models import PhaseTwoConfig
+from ccatp.beacons.sim.motes import true_motes
+from ccatp.beacons.studies.mote_runs import first_map, simulate_field
 from ccatp.config.load import load_radio_config
-from ccatp.sim.motes import true_motes
-from ccatp.studies.mote_runs import first_map, simulate_field
 from tests.unit.beacons.cricket.fields import (
     ADJACENT,
     ALL,

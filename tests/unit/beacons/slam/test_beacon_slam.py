@@ -8,8 +8,10 @@ from time import perf_counter
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.models import FixedLagConfig
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.trajectory import bridged
+from ccatp.beacons.filters.ekf_slam import BlockError
 from ccatp.beacons.slam.batch_smoother import lagged_run, smooth
 from ccatp.beacons.slam.beacon_slam import BeaconSlam, recorded_slam
 from ccatp.beacons.slam.causal import filter_run
@@ -25,10 +27,8 @@ from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import BeaconId, EstimatedPath, Reading, RecordedRun, Steps
 from ccatp.beacons.slam.track_review import range_residuals
-from ccatp.config.beacon_models import FixedLagConfig
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.ekf_slam import BlockError
 from ccatp.filters.metrics import aligned_rms_m, best_motion
 from tests.support.slam_settings import Settings, odometry, settings, trust
 from tests.unit.beacons.datasets.sets import recorded, world

@@ -1,0 +1,225 @@
+"""The commands ``ccatp radio``: estimators on recorded runs, maps of motes from their ranges, signal levels."""
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ccatp.beacons.cli.radio_levels import calibrate, fix, fuzzy
+from ccatp.cli import common
+
+if TYPE_CHECKING:
+    from ccatp.beacons.config.models import CricketConfig
+    from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
+
+FILTERS = ("ekf-slam", "fixed-lag", "smoother")
+
+
+@common.command(
+    "ccatp radio slam recordings/Plaza2_.mat",
+    "ccatp radio slam recordings/MRCLAM_Dataset7 --robot 2 --filter smoother --json",
+    "ccatp radio slam mine.csv --set csv.radio.range_sigma_m=0.3 --figure map.png",
+)
+@click.argument("path", type=common.PATH)
+@click.option(
+    "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv", "bag")),
+    help="Format of the data; found out if not given.",
+)  # fmt: skip
+@click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
+@click.option(
+    "--filter", "filter_name", type=click.Choice(FILTERS), default=FILTERS[0], show_default=True,
+    help="ekf-slam: at each instant from readings up to it; fixed-lag: that, and again some seconds later; "
+    "smoother: from all of them.",
+)  # fmt: skip
+@common.CONFIG_OPTION
+@common.settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
+@click.option("--topics", "topics_file", type=common.PATH, help="Of a ROS bag: a TOML file that names its topics.")
+@common.figure_option("Draw map, path and residuals")
+@click.option(
+    "--tum",
+    "tum_file",
+    type=common.OutputFile(),
+    help="Write the path as evo reads it; the truth to NAME_truth beside it.",
+)
+@click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
+@common.JSON_OPTION
+def slam(
+    path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
+    settings: Mapping[str, object], topics_file: Path | None, figure_file: Path | None, tum_file: Path | None,
+    peers: bool, json_output: bool,
+) -> None:  # fmt: skip
+    """Map the beacons of a recorded run and find the vehicle's path on that map.
+
+    PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, a CSV of events, or a ROS bag
+    (docs/radio_data.md).
+    """
+    from ccatp.beacons.datasets.reader import read_run
+    from ccatp.beacons.slam.evaluation import judge, result_data, table_lines
+    from ccatp.beacons.slam.track_review import review_lines, reviewed
+    from ccatp.beacons.studies.recordings import COMPARED, compared, estimate
+    from ccatp.config.load import load_recordings_config
+    from ccatp.studies.results import markdown_table
+
+    assumed = load_recordings_config(config_file, settings)
+    run = read_run(path, data_format, robot, topics_file)
+    common.warn(run.warnings)
+    track = estimate(run, assumed, filter_name)
+    common.warn(track.warnings)
+    judged = judge(track, run)
+    noise = getattr(assumed, run.kind).radio
+    data: dict[str, Any] = result_data(run, filter_name, track, judged) | reviewed(run, track, noise)
+    if tum_file is not None:
+        _write_tum(tum_file, run, track)
+    if figure_file is not None:
+        from ccatp.beacons.report.plots import draw_slam
+
+        draw_slam(run, track, judged, noise.camera_field_rad, figure_file, f"{run.name}, {filter_name}")
+    if peers:
+        data["peers"] = compared(run, assumed, common.warn)
+    if json_output:
+        click.echo(json.dumps(data, allow_nan=False))
+        return
+    common.print_lines((*table_lines(run, data), *review_lines(data)))
+    if peers:
+        rows = ([one[key] for key in COMPARED] for one in data["peers"])
+        common.print_lines(("", markdown_table(COMPARED, rows).rstrip()))
+
+
+def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:
+    import numpy as np
+
+    from ccatp.beacons.slam.track_review import tum_lines
+
+    paths = {file: (track.times_s, track.poses)}
+    if run.truth is not None:
+        truth = np.column_stack([run.truth.x_m, run.truth.y_m, np.nan_to_num(run.truth.heading_rad)])
+        paths[file.with_stem(f"{file.stem}_truth")] = run.truth.times_s, truth
+    for one, (times_s, poses) in paths.items():
+        one.write_text("\n".join(tum_lines(times_s, poses, run.antenna_m)) + "\n", encoding="utf-8")
+
+
+_flag = partial(common.key_option, is_flag=True, flag_value=True, default=None)
+
+
+@common.command(
+    "ccatp radio map --config cricket --seeds 20",
+    "ccatp radio map --method ekf --set cricket.phase2.pairs=zigzag --figure map.png",
+    "ccatp radio map --ranges ranges.csv --offset --out beacons.toml --json",
+    name="map",
+)
+@common.CONFIG_OPTION
+@click.option("--ranges", "ranges_file", type=common.PATH, help="Measured ranges (CSV) in place of simulated ones.")
+@click.option("--tags", "tags_file", type=common.PATH, help="Places of tags on their trolley (CSV).")
+@click.option("--truth", "truth_file", type=common.PATH, help="True places (CSV) to compare with.")
+@click.option(
+    "--method", type=click.Choice(("ekf", "batch")), default="batch", show_default=True,
+    help="Filter, or all ranges at once.",
+)  # fmt: skip
+@click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N", help="Simulated runs.")
+@common.key_option("--seed", "run.seed", type=click.IntRange(min=0), metavar="N", help="Seed of the first run.")
+@_flag("--offset", "cricket.batch.estimates_offset", help="Estimate a common offset of the ranges.")
+@_flag("--scale", "cricket.batch.estimates_scale", help="Estimate a common scale of the ranges.")
+@common.key_option(
+    "--dimension", "cricket.dimension", type=click.IntRange(2, 3), metavar="D",
+    help="2 for motes in a plane, 3 for motes in space.",
+)  # fmt: skip
+@common.settings_option("A key of cricket, as in cricket.phase2.pairs=zigzag.")
+@click.option("--out", "out_file", type=common.OutputFile(), help="Write a beacon file (TOML).")
+@common.figure_option("Draw map and errors")
+@common.JSON_OPTION
+def radio_map(
+    config_file: Path | None, ranges_file: Path | None, tags_file: Path | None, truth_file: Path | None,
+    method: str, seeds: int, settings: Mapping[str, object], out_file: Path | None, figure_file: Path | None,
+    json_output: bool,
+) -> None:  # fmt: skip
+    """Map beacons from the ranges between them."""
+    if ranges_file is None and (tags_file is not None or truth_file is not None):
+        raise click.UsageError("--tags and --truth go with --ranges; a simulation knows both")
+    if ranges_file is not None and seeds > 1:
+        raise click.UsageError("--seeds is for simulated ranges; --ranges has been measured once")
+    from ccatp.beacons.cricket.measured_map import report_lines
+    from ccatp.config.load import load_radio_config
+
+    system = {"system": "cricket"} if config_file is None else {}
+    cfg = load_radio_config(config_file, {**system, **settings}, simulates=ranges_file is None)
+    if ranges_file is None:
+        data = _simulated(cfg.cricket, method, range(cfg.run.seed, cfg.run.seed + seeds), out_file, figure_file)
+    else:
+        data = _measured(cfg.cricket, method, (ranges_file, tags_file, truth_file), out_file, figure_file)
+    common.warn(data["warnings"])
+    common.print_result(data, report_lines(data), json_output)
+
+
+def _simulated(
+    cfg: "CricketConfig", method: str, seeds: range, out_file: Path | None, figure_file: Path | None
+) -> dict[str, Any]:
+    from ccatp.beacons.report.plots import draw_mote_map
+    from ccatp.beacons.studies.mote_runs import campaign_data, pictured, run_campaign
+
+    campaign = run_campaign(cfg, method, seeds, _progress(len(seeds)))
+    if out_file is not None:
+        run = campaign.runs[0]
+        _write(out_file, run.whole or (run.names, run.positions_m, run.covariance_m2), cfg.layout)
+    if figure_file is not None:
+        draw_mote_map(*pictured(campaign, seeds[0]), figure_file)
+    return campaign_data(campaign)
+
+
+def _measured(
+    cfg: "CricketConfig", method: str, files: tuple[Path, Path | None, Path | None], out_file: Path | None,
+    figure_file: Path | None,
+) -> dict[str, Any]:  # fmt: skip
+    import numpy as np
+
+    from ccatp.beacons.cricket.measured_map import map_measured
+    from ccatp.beacons.datasets.sheets import read_places, read_ranges
+    from ccatp.beacons.report.plots import MapPicture, draw_mote_map
+
+    ranges = read_ranges(files[0], cfg.ranging.sigma_m)
+    tags_m, truth_m = (None if file is None else read_places(file) for file in files[1:])
+    found = map_measured(cfg, method, ranges, tags_m, truth_m)
+    if out_file is not None:
+        _write(out_file, found[:3], "measured")
+    if figure_file is not None:
+        error = found.data["rms_m"]["p50"]
+        title = f"{method}, {len(found.names)} motes" + (f", error {1e3 * error:.3g} mm" if error is not None else "")
+        nothing = np.zeros((0, 2), dtype=np.intp)
+        picture = MapPicture(found.names, found.positions_m, found.covariance_m2, found.true_m, nothing, (), title)
+        draw_mote_map(picture, None, figure_file)
+    return found.data
+
+
+def _write(path: Path, found: tuple[Any, Any, Any], layout: str) -> None:
+    from ccatp.beacons.datasets.sheets import write_beacons
+
+    frame = "field: as the anchors and surveyed places of the configuration say"
+    if layout != "networks":
+        frame = "own: first beacon at the origin, second on +x, third at y > 0; covariance of the aligned map"
+    write_beacons(path, *found, frame)
+
+
+def _progress(total: int) -> Callable[[int], None]:
+    is_live = sys.stderr.isatty()
+
+    def show(done: int) -> None:
+        if total == 1:
+            return
+        if is_live:
+            click.echo(f"\rccatp: {done} of {total} runs", nl=done == total, err=True)
+        elif 10 * done // total > 10 * (done - 1) // total:
+            common.complain(f"{done} of {total} runs", 0)
+
+    return show
+
+
+@click.group(cls=common.CommandGroup, epilog=common.example("ccatp radio slam recordings/Plaza2_.mat"))
+def radio() -> None:
+    """Robots among radio beacons: mapping them, finding the way by them."""
+
+
+for command in (slam, calibrate, fix, fuzzy, radio_map):
+    radio.add_command(command)

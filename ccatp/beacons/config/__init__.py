@@ -1,0 +1,1 @@
+"""Configuration of the robots among beacons: models, checks and loading."""

@@ -1,0 +1,1 @@
+"""The mission among beacons in the main-loop process."""

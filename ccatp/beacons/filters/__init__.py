@@ -1,0 +1,1 @@
+"""The filter over poses and beacons, on arrays."""

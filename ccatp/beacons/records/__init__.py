@@ -1,0 +1,1 @@
+"""Database and summary of a mission among beacons."""

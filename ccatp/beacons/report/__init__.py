@@ -1,0 +1,1 @@
+"""Report, figures and page of missions among beacons."""

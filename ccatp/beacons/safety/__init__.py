@@ -1,0 +1,1 @@
+"""Rules of the danger loop for robots among beacons."""

@@ -1,0 +1,1 @@
+"""The simulated robots, radios, motes and rooms. It imports no estimator."""

@@ -1,0 +1,1 @@
+"""Campaigns of robots among beacons, recorded runs, and peers."""

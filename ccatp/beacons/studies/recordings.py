@@ -1,0 +1,306 @@
+"""The study `recordings`: estimators on the shipped sets, over the whole run and from later starts.
+
+The estimators are our own ones, and with ``--peers`` those of GTSAM.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ccatp.beacons.config.models import RecordingsConfig
+from ccatp.beacons.cricket.measured_map import map_measured
+from ccatp.beacons.datasets.checks import survey_doubts
+from ccatp.beacons.datasets.formats import run_of_events
+from ccatp.beacons.datasets.reader import checked_run, read_run
+from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
+from ccatp.beacons.datasets.tables import Table
+from ccatp.beacons.datasets.trajectory import pose_of_truth
+from ccatp.beacons.slam.batch_smoother import lagged_run, smooth
+from ccatp.beacons.slam.causal import filter_run
+from ccatp.beacons.slam.evaluation import judge, result_data
+from ccatp.beacons.slam.level_fix import LevelLocator, fingerprint_fits, grid_points, judged
+from ccatp.beacons.slam.path_loss import fit_path_loss
+from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, ReferencePath
+from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, import_gtsam, run_gtsam
+from ccatp.config.load import load_radio_config
+from ccatp.core import FloatArray
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.filters.base import FilterError
+from ccatp.studies.campaign import CampaignError, Cell, CellResult, Factors, Job, JobOutcome, Study
+from ccatp.studies.results import Measure, draw_ranges, rows_by
+
+FILTERS = ("ekf-slam", "fixed-lag", "smoother")
+PEERS = ("GTSAM iSAM2", "GTSAM batch")
+
+
+class EstimateError(CcatpError):
+    """Data from which an estimator gets no result."""
+
+    exit_status = ExitStatus.USAGE
+
+
+def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> EstimatedPath:
+    """Estimate a run by one of ``FILTERS``.
+
+    Raises EstimateError: the estimate is not finite, or the data do not determine it.
+    """
+    cfg = getattr(assumed, run.kind)
+    try:
+        if filter_name == "smoother":
+            track = smooth(run, cfg, assumed.filter, perf_counter)
+        elif filter_name == "fixed-lag":
+            track = lagged_run(run, cfg, assumed.filter, perf_counter, assumed.fixed_lag)
+        else:
+            track = filter_run(run, cfg, assumed.filter, perf_counter)
+    except (FilterError, np.linalg.LinAlgError) as error:
+        raise EstimateError(
+            f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"
+        ) from error
+    if run.truth is not None:
+        return track
+    return track._replace(warnings=(*track.warnings, *survey_doubts(track, run.beacon_truth_m)))
+
+
+COMPARED = (
+    "dataset", "filter", "trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "range_scale", "nis_mean",
+    "nees_mean", "update_us_p50", "run_s", "gave_up",
+)  # fmt: skip
+
+
+def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[str]], None]) -> list[dict[str, Any]]:
+    """A row of ``COMPARED`` for each of our estimators and GTSAM's.
+
+    If GTSAM fails, its rows have no values, and there is a warning. Raises PeerError: GTSAM is not installed.
+    """
+    import_gtsam()  # fails before the computation
+    tracks: list[tuple[str, EstimatedPath | None, float | None]] = []
+    for name in FILTERS:
+        begin_s = perf_counter()
+        tracks.append((name, estimate(run, assumed, name), perf_counter() - begin_s))
+    try:
+        isam2, batch = run_gtsam(run, getattr(assumed, run.kind), perf_counter)
+        # The batch starts from the result of iSAM2, so its time is not that of a run.
+        tracks += [(PEERS[0], isam2, float(isam2.update_s.sum())), (PEERS[1], batch, None)]
+    except PeerGaveUp as error:
+        warn([str(error)])
+        tracks += [(name, None, None) for name in PEERS]
+    rows = []
+    for name, track, run_s in tracks:
+        data = {} if track is None else result_data(run, name, track, judge(track, run))
+        if name in PEERS:
+            data["nees_mean"] = None  # covariances of the peers are not computed
+        known = {"dataset": run.name, "filter": name, "run_s": run_s, "gave_up": track is None}
+        rows.append({key: data.get(key) for key in COMPARED} | known)
+    return rows
+
+
+# -- the shipped sets -------------------------------------------------------------------------------------------------
+
+
+class RecordedSet(NamedTuple):
+    """Path of a set in the folder of recordings, and its robots."""
+
+    path: str
+    robots: tuple[int | None, ...] = (None,)
+
+
+SETS = {
+    "Plaza2": RecordedSet("plaza/Plaza2_.mat"),
+    "MRCLAM 7": RecordedSet("mrclam/set7", (1, 2, 3, 4, 5)),
+    "Labyrinth": RecordedSet("uwb_labyrinth/labyrinth_0_600s.txt.gz"),
+    "MRCLAM 3": RecordedSet("mrclam/set3", (3, 5)),
+}
+ANCHORS = "UWB anchors 8/14"
+ANCHOR_METHODS = {"batch": False, "batch, offset": True}
+LEVELS = "XBee scenario 1"
+LEVEL_METHODS = ("fingerprints", "fingerprints, each by the others", "path-loss sheet")
+XBEE_M = {"A": (0.0, 0.0), "B": (0.0, 4.0), "C": (4.0, 0.0)}  # corners of a square of 4 m: fits text and levels
+XBEE_ROOM = grid_points((-1.0, -1.0), (5.0, 5.0), 0.1)
+
+
+@cache
+def shipped_run(folder: str, name: str, robot: int | None) -> RecordedRun:
+    """One run of a set. Raises CampaignError: no folder is given. Raises RadioDataError: the set does not exist."""
+    if not folder:
+        raise CampaignError("where the recordings are is not known; give --data DIR")
+    return read_run(Path(folder) / SETS[name].path, None, robot)
+
+
+@cache
+def shipped_window(folder: str, name: str, robot: int | None, begin_s: float, length_s: float) -> RecordedRun:
+    """A part of a run, times in s from the beginning of the run; its first pose is from the truth, if there is one.
+
+    The checks of the reader do not use the truth.
+    """
+    run = shipped_run(folder, name, robot)
+    tables, truth = events_of(run, begin_s, begin_s + length_s)
+    return read_again(run, tables, truth)
+
+
+def events_of(run: RecordedRun, begin_s: float, end_s: float) -> tuple[dict[str, Table], ReferencePath | None]:
+    """The recorded events of a part of a run, as tables of our CSV format, and the truth of that part."""
+    start_s = run.steps.times_s[0]
+
+    def table(*columns: FloatArray) -> Table:
+        values = np.column_stack(columns)
+        inside = (values[:, 0] >= start_s + begin_s) & (values[:, 0] <= start_s + end_s)
+        return Table(Path(run.name), values[inside], np.flatnonzero(inside) + 1)
+
+    steps, readings, known = run.steps, run.readings, np.isfinite
+    moves = (np.concatenate([[0.0], column]) for column in (steps.distance_m, steps.turn_rad, steps.lateral_m))
+    tables = {"odom": table(steps.times_s, *moves)}
+    for kind, column in zip(("range", "bearing", "rssi"), readings[2:], strict=True):
+        there = known(column)
+        if there.any():
+            tables[kind] = table(readings.times_s[there], readings.beacon[there].astype(float), column[there])
+    truth = None if run.truth is None else ReferencePath(*table(*run.truth).values.T)
+    return tables, truth
+
+
+def read_again(run: RecordedRun, tables: Mapping[str, Table], truth: ReferencePath | None) -> RecordedRun:
+    """A run from tables of events, as read and checked by the reader without the truth, which is added afterwards."""
+    again = checked_run(run_of_events(Path(run.name), dict(tables), run.beacon_ids), Path(run.name))
+    pose = pose_of_truth(truth, again.steps, [])
+    return replace(again, name=run.name, kind=run.kind, first_pose=pose, truth=truth, beacon_truth_m=run.beacon_truth_m)
+
+
+# -- recordings -------------------------------------------------------------------------------------------------------
+
+START_SHARE, MOST_SHARE = 0.1, 0.8  # of the run: delay of the start per seed, largest delay; seed 0 has the whole run
+_ERRORS = {"path_m": "trajectory_rmse_m", "heading_rad": "heading_rmse_rad", "beacons_m": "beacon_rmse_m"}
+_DELAYED = {"delayed_path_m": "trajectory_rmse_m", "delayed_nees": "nees_mean"}
+_SHOWN = {"range_scale": "range_scale", "nis": "nis_mean", "nees": "nees_mean", "update_us": "update_us_p50"}
+
+
+def run_recordings(job: Job) -> JobOutcome:
+    """One estimator on one set, the whole run or from a later start: means over its robots."""
+    cfg, name, estimator = job.cfg, str(job.factors["data"]), str(job.factors["estimator"])
+    share = START_SHARE * job.seed
+    if share > MOST_SHARE:
+        raise CampaignError(f"a recording is started at most {MOST_SHARE:.0%} later; give a smaller --seed or --runs")
+    if name == ANCHORS:
+        return _mapped_anchors(cfg, share, with_offset=ANCHOR_METHODS[estimator])
+    if name == LEVELS:
+        return _fixed_levels(Path(cfg.run.data) / "xbee_rssi/Scenario1", share, estimator)
+    rows = []
+    for robot in SETS[name].robots:
+        run = shipped_run(cfg.run.data, name, robot)
+        if share > 0.0:
+            span_s = float(run.steps.times_s[-1] - run.steps.times_s[0])
+            run = shipped_window(cfg.run.data, name, robot, share * span_s, span_s)
+        begin_s = perf_counter()
+        if estimator in FILTERS:
+            track, run_s = estimate(run, cfg, estimator), None
+        else:
+            try:
+                track = run_gtsam(run, getattr(cfg, run.kind), perf_counter)[PEERS.index(estimator)]
+            except PeerGaveUp:  # a mean over the other runs only could not be compared
+                return JobOutcome({"gave_up": True})
+        run_s = perf_counter() - begin_s
+        data = result_data(run, estimator, track, judge(track, run))
+        row = {key: data[value] for key, value in (_ERRORS | _SHOWN).items()}
+        late = data["delayed"] or dict.fromkeys(_DELAYED.values())
+        rows.append(row | {key: late[value] for key, value in _DELAYED.items()} | {"run_s": run_s})
+    values = {key: [one[key] for one in rows] for key in rows[0]}
+    if estimator not in FILTERS:
+        values["nees"] = [None]  # covariances of the peers are not computed
+    return JobOutcome({"robots": values, **{key: _mean(each) for key, each in values.items()}})
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _mapped_anchors(cfg: RecordingsConfig, share: float, *, with_offset: bool) -> JobOutcome:
+    """Map of surveyed anchors from the standstills of a trolley, without those before the start."""
+    file = Path(cfg.run.data) / "uwb_planar/session_8_14.csv"
+    cricket = load_radio_config(
+        None, {"system": "cricket", "cricket.batch.estimates_offset": with_offset}, simulates=False
+    ).cricket
+    ranges, begin_s = read_ranges(file, cricket.ranging.sigma_m), perf_counter()
+    poses = list(ranges.groups)[round(share * len(ranges.groups)) :]
+    motes = {mote for pose in poses for mote in ranges.groups[pose]}
+    kept = ranges._replace(
+        readings=tuple(one for one in ranges.readings if motes & {one.first, one.second}),
+        groups={pose: ranges.groups[pose] for pose in poses},
+    )
+    rows = re.findall(r"Anchor (\d) *\| *(\S+) *\| *(\S+) *\|", file.with_name("README.md").read_text(encoding="utf-8"))
+    truth_m = {f"anchor{number}": (float(x_m), float(y_m)) for number, x_m, y_m in rows}
+    found = map_measured(cricket, "batch", kept, None, truth_m)
+    return JobOutcome({"beacons_m": found.data["rms_m"]["p50"], "run_s": perf_counter() - begin_s})
+
+
+def _fixed_levels(folder: Path, share: float, method: str) -> JobOutcome:
+    """Positions from one level of each radio, without those before the start.
+
+    The names B and C are exchanged in the file of test points.
+    """
+    begin_s, is_by_others = perf_counter(), method == LEVEL_METHODS[1]
+    known = read_level_places(folder / "Database_Scenario1.xlsx")[1]
+    tests = [place.renamed({"B": "C", "C": "B"}) for place in read_level_places(folder / "Tests_Scenario1.xlsx")[1]]
+    places = list(known) if is_by_others else tests
+    first = round(share * len(places))
+    if method == LEVEL_METHODS[2]:
+        fits = dict.fromkeys(XBEE_M, fit_path_loss(read_levels(folder / "Pathloss_Scenario1.xlsx", "Zigbee", None)[1]))
+        each = [fits] * len(places)
+    else:
+        each = [fingerprint_fits(known, XBEE_M, k if is_by_others else None) for k in range(len(places))]
+    found = [
+        LevelLocator(XBEE_M, one, XBEE_ROOM).fix(p.levels_dbm)
+        for one, p in zip(each[first:], places[first:], strict=True)
+    ]
+    result = judged(found, places[first:], 0.9)
+    values = {"path_m": result["mean_error_m"], "covered": result["coverage"], "run_s": perf_counter() - begin_s}
+    return JobOutcome(values)
+
+
+def combine_recordings(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+    """Values of the whole run, and median and 10 to 90 % of the errors over the later starts."""
+    whole, later = dict(outcomes[0].values), [outcome.values for outcome in outcomes[1:]]
+    whole["gave_up"] = sum("gave_up" in outcome.values for outcome in outcomes)
+    for key in _ERRORS:
+        known = [one[key] for one in later if one.get(key) is not None]
+        ends = np.percentile(known, (10, 50, 90)).tolist() if known else [None] * 3
+        whole[f"started_{key}"] = dict(zip(("p10", "p50", "p90"), ends, strict=True))
+    return JobOutcome(whole)
+
+
+def recordings_cells(estimators: Sequence[str] = FILTERS) -> list[Cell]:
+    """Sets times estimators, the map of surveyed anchors, and positions from levels (mean error as ``path_m``)."""
+    cells = [Cell({"data": name, "estimator": one}) for name in SETS for one in estimators]
+    others = {ANCHORS: ANCHOR_METHODS, LEVELS: LEVEL_METHODS}
+    return cells + [Cell({"data": name, "estimator": one}) for name, methods in others.items() for one in methods]
+
+
+def draw_recordings(cells: Sequence[CellResult], out: Path) -> None:
+    """Figure ``recordings``: whole run (mark), later starts (median as a dot, 10 to 90 % as a bar)."""
+    measures = [
+        Measure(label, (f"started_{key}.p10", f"started_{key}.p90"), f"started_{key}.p50", key)
+        for key, label in (("path_m", "error of the path, m"), ("beacons_m", "error of the beacons, m"))
+    ]
+    title = "Later starts: median (dot), 10 to 90 % (bar); whole run (mark)"
+    draw_ranges(rows_by(cells, "data", "estimator"), measures, title, out / "recordings")
+
+
+RECORDINGS = Study(
+    cells=recordings_cells,
+    with_peers=lambda: recordings_cells((*FILTERS, *PEERS)),
+    run_job=run_recordings,
+    combine=combine_recordings,
+    columns="""
+        path_m heading_rad beacons_m range_scale nis nees delayed_path_m delayed_nees covered gave_up update_us run_s
+        started_path_m: p10 p50 p90
+        started_beacons_m: p10 p50 p90
+    """,
+    draw=draw_recordings,
+    mirrors=(),
+    runs=6,
+    loader="load_recordings_config",
+)

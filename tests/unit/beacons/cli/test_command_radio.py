@@ -1,0 +1,252 @@
+"""The commands ``ccatp radio slam``, ``calibrate``, ``fix``, ``fuzzy``; survey commands given a run among beacons."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.slam.evaluation import judge
+from ccatp.beacons.studies.gtsam_peer import PeerError, PeerGaveUp, run_gtsam
+from ccatp.cli import main
+from ccatp.config.load import load_recordings_config
+from ccatp.filters.base import FilterDiverged
+from tests.support.command import answered, printed
+from tests.unit.beacons.datasets.sets import (
+    BEACONS,
+    csv_lines,
+    labyrinth_lines,
+    recorded,
+    world,
+    write_lines,
+    write_mrclam,
+    write_plaza,
+)
+
+CONTRACT = {
+    "dataset", "filter", "trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "beacons", "range_scale",
+    "range_offset_m", "nis_mean", "nees_mean", "updates", "update_us_p50", "warnings",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A minute of a simulated run."""
+    return write_lines(tmp_path_factory.mktemp("csv") / "mine.csv", csv_lines(world(seconds=60.0)))
+
+
+def said(capsys: pytest.CaptureFixture[str], *argv: object) -> tuple[int, str, str]:
+    status = main([str(part) for part in argv])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def reported(capsys: pytest.CaptureFixture[str], *argv: object) -> Any:
+    return answered(capsys, "radio", *argv)
+
+
+@pytest.mark.parametrize("filter_name", ["ekf-slam", "fixed-lag", "smoother"])
+def test_json_is_the_contracts(
+    recording: Path, tmp_path: Path, filter_name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "map.png"
+    argv = ("radio", "slam", recording, "--filter", filter_name, "--json", "--figure", picture)
+    status, out, err = said(capsys, *argv)
+    data = json.loads(out)
+    assert status == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert set(data) >= CONTRACT
+    assert (data["dataset"], data["filter"]) == ("mine", filter_name)
+    assert data["trajectory_rmse_m"] < 0.1
+    assert data["heading_rmse_rad"] < 0.1
+    assert data["beacon_rmse_m"] < 0.2
+    assert set(data["beacons"]) == set(BEACONS)
+    offsets = [np.hypot(*np.subtract(data["beacons"][name], place)) for name, place in BEACONS.items()]
+    assert np.sqrt(np.mean(np.square(offsets))) == pytest.approx(data["beacon_rmse_m"])
+    assert data["range_scale"] == pytest.approx(1.0, abs=0.1)
+    assert data["updates"] > 200
+    assert data["update_us_p50"] > 0.0
+    assert (data["nis_mean"] is None) == (filter_name == "smoother")
+    assert data["nees_mean"] > 0.0
+    assert (data["delayed"] is None) == (filter_name != "fixed-lag")
+    assert all(warning in err for warning in data["warnings"])
+
+
+def test_what_is_not_known_is_null(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_plaza(tmp_path, world(seconds=30.0), mat=False)
+    (tmp_path / "Field1_GT.txt").unlink()
+    (tmp_path / "Field1_TL.txt").unlink()
+    data = reported(capsys, "slam", file, "--filter", "smoother", "--set", "plaza.priors.range_scale=0.0")
+    unknown = ("trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "nees_mean", "range_scale")
+    assert {data[key] for key in unknown} == {None}
+    assert len(data["beacons"]) == len(BEACONS)
+
+
+def test_a_truth_of_one_row_is_no_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = labyrinth_lines(world(seconds=30.0))
+    first = next(line for line in lines if line.startswith("gt2"))
+    file = write_lines(tmp_path / "lab.txt", [first, *(line for line in lines if not line.startswith("gt2"))])
+    data = reported(capsys, "slam", file, "--filter", "smoother")
+    assert data["trajectory_rmse_m"] is data["nees_mean"] is None
+    assert data["beacon_rmse_m"] < 0.5
+    assert any("no reference trajectory: the truth has 1 row" in warning for warning in data["warnings"])
+
+
+def test_the_table_names_what_was_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_mrclam(tmp_path, world(seconds=30.0), robot=3)
+    out = said(capsys, "radio", "slam", tmp_path, "--robot", "3", "--filter", "smoother")[1]
+    for word in ("robot 3 (mrclam): 30 s", "smoother: ", "m rms, heading", "turn_scale", "NEES"):
+        assert word in out
+    places, residuals, advice = (part.splitlines() for part in out.split("\n\n")[-3:])
+    for rows in (places, residuals):
+        assert {row.split()[0] for row in rows[1:]} == set(BEACONS)
+    assert advice[0].startswith("measure next: beacon ")
+
+
+@pytest.mark.parametrize("error", [FilterDiverged("prediction is not finite"), np.linalg.LinAlgError("singular")])
+def test_an_estimator_that_finds_nothing(
+    recording: Path, error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def diverging(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("ccatp.beacons.studies.recordings.filter_run", diverging)
+    assert main(["radio", "slam", str(recording)]) == 2
+    assert f"mine: ekf-slam finds no finite map for these data ({error})" in capsys.readouterr().err.splitlines()[-1]
+
+
+XBEE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "radio" / "xbee_rssi"
+needs_xbee = pytest.mark.skipif(not XBEE.is_dir(), reason="the XBee sheets are not beside the checkout")
+CORNERS = ("--beacon", "A=0,0", "--beacon", "B=0,4", "--beacon", "C=4,0")
+
+
+def pairs(folder: Path) -> Path:
+    rows = [f"{d},{-45.0 - 25.0 * np.log10(d) + 0.5 * (-1) ** k:.4f}" for k, d in enumerate((0.5, 1, 2, 3, 4, 5))]
+    (folder / "pairs.csv").write_text("distance_m,rssi_dbm\n" + "\n".join(rows) + "\n")
+    return folder / "pairs.csv"
+
+
+def test_calibrate_prints_what_the_configuration_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = said(capsys, "radio", "calibrate", pairs(tmp_path), "--figure", tmp_path / "a.png")
+    assert (status, err) == (0, "")
+    assert "reference_dbm = -44." in out
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    found = reported(capsys, "calibrate", pairs(tmp_path))
+    assert found["exponent"] == pytest.approx(2.5, abs=0.3)
+    assert found["places"] == 6
+    assert found["white_sigma_db"] is None
+
+
+def test_fuzzy_tells_the_speed_at_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = reported(capsys, "fuzzy", "--at", 2.0, 0.0, "--at", 0.05, 2.0, "--figure", tmp_path / "b.png")
+    assert [point["speed_m_s"] for point in found["points"]] == [0.15, 0.05]
+    assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
+
+
+def places(folder: Path) -> Path:
+    rows = []
+    for x in (0.5, 1.5, 2.5, 3.5):
+        for y in (0.5, 1.5, 2.5, 3.5):
+            r = [np.hypot(x - bx, y - by) for bx, by in ((0, 0), (0, 4), (4, 0))]
+            rows.append(f"{x},{y}," + ",".join(f"{-45.0 - 25.0 * np.log10(d) + 0.1 * ((x + y) % 2):.3f}" for d in r))
+    (folder / "places.csv").write_text("x,y,RSSI A,RSSI B,RSSI C\n" + "\n".join(rows) + "\n")
+    return folder / "places.csv"
+
+
+def test_fix_finds_places_and_exchanged_beacons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = places(tmp_path)
+    found = reported(capsys, "fix", file, *CORNERS, "--fingerprints", file)
+    assert found["leave_one_out"] is True
+    assert found["mean_error_m"] < 0.15
+    other = tmp_path / "other.csv"
+    other.write_text(file.read_text().replace("RSSI B,RSSI C", "RSSI C,RSSI B"))
+    status, out, err = said(capsys, "radio", "fix", other, *CORNERS, "--fingerprints", file)
+    assert status == 0
+    assert "beacons look exchanged: B is C, C is B" in err
+    exchanged = reported(capsys, "fix", other, *CORNERS, "--fingerprints", file, "--exchange", "B,C")
+    assert exchanged["mean_error_m"] < 0.15
+    assert "mean error" in out
+
+
+@needs_xbee
+def test_xbee_scenario_1_is_fixed_within_its_limit(capsys: pytest.CaptureFixture[str]) -> None:
+    folder = XBEE / "Scenario1"
+    common = (*CORNERS, "--fingerprints", folder / "Database_Scenario1.xlsx")
+    tests = reported(capsys, "fix", folder / "Tests_Scenario1.xlsx", "--exchange", "B,C", *common)
+    own = reported(capsys, "fix", folder / "Database_Scenario1.xlsx", *common)
+    assert tests["mean_error_m"] <= 1.3
+    assert own["mean_error_m"] <= 1.3
+    inside = (tests["in_region"] + own["in_region"]) / (len(tests["points"]) + len(own["points"]))
+    assert 0.80 <= inside <= 0.95
+
+
+@needs_xbee
+def test_xbee_sheets_and_logs_agree(capsys: pytest.CaptureFixture[str]) -> None:
+    sheet = XBEE / "Scenario1" / "Pathloss_Scenario1.xlsx"
+    one = reported(capsys, "calibrate", sheet)
+    logs = XBEE / "Scenario1" / "Pathloss" / "Zigbee"
+    other = reported(capsys, "calibrate", logs, "--points", sheet)
+    assert other["readings"] == 900
+    assert other["exponent"] == pytest.approx(one["exponent"], abs=0.05)
+    assert other["shadowing_sigma_db"] > 5.0 * other["white_sigma_db"]
+
+
+# -- GTSAM on the same input: it solves what it can, and says so where it cannot --------------------------------------
+
+SETTINGS = load_recordings_config().csv
+
+
+def no_clock() -> float:
+    """Time stands still."""
+    return 0.0
+
+
+@pytest.mark.parametrize("bearings", [True, False], ids=["range-bearing", "range-only"])
+def test_both_solve_a_run_without_calibration_errors(bearings: bool) -> None:
+    pytest.importorskip("gtsam", reason="the extra peers is not installed")
+    run = recorded(world(seconds=60.0), bearings=bearings)
+    peers = run_gtsam(run, SETTINGS, no_clock)
+    for track in peers:
+        found = judge(track, run)
+        assert found.trajectory_rmse_m == pytest.approx(0.0, abs=0.1)
+        assert found.beacon_rmse_m == pytest.approx(0.0, abs=0.15)
+        assert set(track.beacons) == set(BEACONS)
+    assert len(peers.isam2.update_s) == len(run.readings.times_s)
+
+
+def test_what_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("gtsam", reason="the extra peers is not installed")
+    run = recorded(world(seconds=20.0))
+    nothing = np.full(len(run.readings.times_s), np.nan)
+    received = replace(run, readings=run.readings._replace(range_m=nothing, rssi_dbm=nothing - 50.0))
+    with pytest.raises(PeerGaveUp, match="no factor of signal strengths"):
+        run_gtsam(received, SETTINGS, no_clock)
+    with pytest.raises(PeerGaveUp, match=r"^simulated: GTSAM gave up: .*$"):
+        run_gtsam(replace(run, first_pose=(np.nan, 0.0, 0.0)), SETTINGS, no_clock)
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    with pytest.raises(PeerError, match=r"ccatp\[peers\]"):
+        run_gtsam(run, SETTINGS, no_clock)
+
+
+def test_slam_with_peers_prints_all_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gtsam", reason="the extra peers is not installed")
+    file = write_lines(tmp_path / "mine.csv", csv_lines(world(seconds=20.0)))
+    rows = [
+        line for line in printed(capsys, "radio", "slam", file, "--peers").splitlines() if line.startswith("| mine")
+    ]
+    names = [line.split("|")[2].strip() for line in rows]
+    assert names == ["ekf-slam", "fixed-lag", "smoother", "GTSAM iSAM2", "GTSAM batch"]
+
+
+def test_a_peer_that_gives_up_leaves_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gtsam", reason="the extra peers is not installed")
+    lines = [line for line in csv_lines(world(seconds=20.0)) if not line.startswith("range,")]
+    assert main(["radio", "slam", str(write_lines(tmp_path / "bearings.csv", lines)), "--peers"]) == 0
+    out, err = capsys.readouterr()
+    rows = [[cell.strip() for cell in line.split("|")[2:-1]] for line in out.splitlines() if line.startswith("| bear")]
+    assert [row[0] for row in rows if row[-1] == "True"] == ["GTSAM iSAM2", "GTSAM batch"]
+    assert len(rows) == 5
+    assert "warning: bearings: not all readings have a range" in err
