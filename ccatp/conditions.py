@@ -9,11 +9,13 @@ at a time. ``docs/alarms.md`` is generated from these rows. A mission may regist
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, StrEnum
-from functools import partial
+from functools import cache, partial
+from importlib import import_module
 from math import isfinite
 from typing import NamedTuple, ParamSpec
 
 from ccatp.core import ALL_MOTION, NO_MOTION, Cause, EventCode, Permits, Severity, Verdict
+from ccatp.missions import all_kinds
 
 
 class Motion(Enum):
@@ -105,7 +107,6 @@ class Group(StrEnum):
     FANS = "Fans and battery"
     LINK = "Link and clock"
     SURVEY = "The survey"
-    BEACONS = "Among beacons"
     STORAGE = "Storage"
     OBSERVATORY = "The observatory"
 
@@ -126,7 +127,7 @@ class Condition:
     name: str
     owner: Owner
     precedence: int
-    group: Group
+    group: str  # one of ``Group``, or a chapter of a mission's own
     message: str
     meaning: str
     advice: str
@@ -195,8 +196,28 @@ class MonitorFinding(NamedTuple):
         )
 
 
-TABLE: dict[str, Condition] = {}  # all registered rows by name
+TABLE: dict[str, Condition] = {}  # the rows by name that this process has registered
 P = ParamSpec("P")
+
+
+@cache
+def _register_all() -> None:
+    for kind in all_kinds():
+        if kind.conditions:
+            import_module(kind.conditions)
+
+
+def find_condition(name: str) -> Condition | None:
+    """The row of a name; ``None``: no kind of mission has it, or there is no cause."""
+    if name and name not in TABLE:
+        _register_all()
+    return TABLE.get(name)
+
+
+def all_conditions() -> tuple[Condition, ...]:
+    """The rows of every kind of mission."""
+    _register_all()
+    return tuple(TABLE.values())
 
 
 def registered(make: Callable[P, Condition]) -> Callable[P, Condition]:
@@ -214,20 +235,20 @@ def registered(make: Callable[P, Condition]) -> Callable[P, Condition]:
 
 # Usual fields of a row by its action; a row may override them.
 _wait = partial(Condition, action=Action.PAUSE, motion=Motion.NONE, clear=Clear.AUTO)
-_beacon_hold = partial(
-    Condition,
-    action=Action.HOLD,
-    motion=Motion.NONE,
-    clear=Clear.AUTO,
-    limit="danger.hold_limit_s",
-    escalates_to=Action.FAULT,
-)
 inform = registered(partial(Condition, action=Action.INFORM, motion=Motion.ANY))
 slow = registered(partial(Condition, action=Action.SLOW, motion=Motion.ANY))
 wait = registered(_wait)
 pause = registered(partial(_wait, limit="health.pause_limit_s", escalates_to=Action.HOLD))
-beacon_hold = registered(_beacon_hold)
-hold = registered(partial(_beacon_hold, clear=Clear.AFTER_FIX, limit="health.hold_limit_s"))
+hold = registered(
+    partial(
+        Condition,
+        action=Action.HOLD,
+        motion=Motion.NONE,
+        clear=Clear.AFTER_FIX,
+        limit="health.hold_limit_s",
+        escalates_to=Action.FAULT,
+    )
+)
 # More than ``health.retries`` of them within ``health.retry_window_s`` are a fault.
 diverged = registered(partial(Condition, action=Action.HOLD, motion=Motion.NONE, clear=Clear.AFTER_FIX))
 go_home = registered(partial(Condition, action=Action.RETURN, motion=Motion.RETURN))
@@ -466,26 +487,6 @@ EMERGENCY = go_home("emergency", Owner.DANGER, 570, Group.OBSERVATORY, "emergenc
     "Fire, power, weather or an operator's emergency: the robot goes home at once.",
     "Clear it when its cause is gone and the robot is at base or held.", action=Action.ABORT)
 
-# -- among beacons ----------------------------------------------------------------------------------------------------
-
-RADIO_SILENT = beacon_hold("radio_silent", Owner.DANGER, 580, Group.BEACONS, "no beacon is received",
-    "No reading of a beacon for `danger.radio_timeout_s`.", "Check the robot's radio and the beacons' supply.",
-    unit="s")
-NO_FRESH_ESTIMATE = beacon_hold("no_fresh_estimate", Owner.DANGER, 590, Group.BEACONS, "no fresh estimate",
-    "Main has not reported where the robot is for `danger.estimate_timeout_s`.",
-    "Is something else busy on this machine?", unit="s")
-POSITION_UNCERTAIN = beacon_hold("position_uncertain", Owner.DANGER, 600, Group.BEACONS,
-    "the position is too uncertain",
-    "Its standard deviation is above `danger.position_sigma_m`. It ends below `danger.position_clear_m`.",
-    "Nothing, unless it lasts: beacons may fail.", unit="m")
-OBSTACLE_AHEAD = near("obstacle_ahead", Owner.DANGER, 610, Group.BEACONS, "an obstacle ahead",
-    "An echo is nearer than `danger.obstacle_m` on the course. Code 1.", "Nothing: the robot drives around it.")
-TARGET_NEAR = near("target_near", Owner.DANGER, 620, Group.BEACONS, "the target is too near",
-    "By its level, the followed radio is nearer than `danger.target_m`. Code 1.",
-    "Nothing: the robot waits until it is farther away.")
-OBSTACLE_BEHIND = near("obstacle_behind", Owner.DANGER, 630, Group.BEACONS, "an obstacle behind",
-    "An echo is nearer than `danger.obstacle_m` behind the robot: no reverse. Code 1.", "Nothing.")
-
 
 # == conditions that a mission, its localizer or the main loop finds ==================================================
 
@@ -577,14 +578,6 @@ FILTER_DIVERGED = diverged("filter_diverged", Owner.LOCALIZER, ALONE, Group.SURV
     "The estimate is not a valid Gaussian any more. The pose is frozen until the next fix; a fault if it repeats.",
     "If it repeats, keep the run directory.")
 
-FRAMES_MISSED = fault("frames_missed", Owner.MISSION, ALONE, Group.BEACONS,
-    "no frames while the robot moved: put it at its start and start a new mission",
-    "The robot booted, or the link was away while it may have moved; the map of the beacons is not kept.",
-    "`ccatp stop`, put it at its start, start again.")
-MISSION_TOO_LONG = fault("mission_too_long", Owner.MISSION, ALONE, Group.BEACONS,
-    "the mission takes longer than mission.time_limit_s = {limit_s:g}",
-    "The robot is held where it is.", "`ccatp abort` sends it home; or configure a longer time.")
-
 FIX_NOT_STORED = fault("fix_not_stored", Owner.FIXES, ALONE, Group.STORAGE,
     "the fix of {point} cannot be stored: {why}",
     "The disk is full or broken, or another program locks the database.",
@@ -611,7 +604,7 @@ def text_of(cause: Cause) -> str:
     """The text of a cause for people; a cause without a row here, of a newer version, is shown by its name."""
     if not cause:
         return ""
-    row = TABLE.get(cause.condition)
+    row = find_condition(cause.condition)
     try:
         text = cause.condition if row is None else row.message.format(**cause.values)
     except (KeyError, ValueError, IndexError):  # the values are of another version
@@ -625,8 +618,8 @@ def text_of(cause: Cause) -> str:
 
 def danger_text(condition: str, cause: str, signal: str, value: float, limit: float) -> str:
     """Like ``estimate stale: 0.31 s (limit 0.15 s)``; without a limit of 0 or a signal that ``cause`` names."""
-    named, row = signal.replace("_", " "), TABLE.get(condition)
-    is_named = not named or named in cause or (row is not None and row.group is Group.OBSERVATORY)
+    named, row = signal.replace("_", " "), find_condition(condition)
+    is_named = not named or named in cause or (row is not None and row.group == Group.OBSERVATORY)
     where = "" if is_named else f" ({named})"
     if not limit:
         return cause + where

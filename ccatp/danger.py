@@ -23,16 +23,16 @@ import msgspec
 
 from ccatp import conditions
 from ccatp.conditions import MonitorFinding
-from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
+from ccatp.config.models import Config, DangerConfig, HealthConfig, RobotConfig
 from ccatp.core import NO_MOTION, Corner, EdgeSample, EventCode, Permits, SteadyTime, Verdict, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
-from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
-from ccatp.safety.emergency_latch import EmergencyRules
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
 from ccatp.safety.monitor import HealthMonitor
+from ccatp.safety.rules import FrameRules, SafetyRules
 from ccatp.sensing.sample_times import possible_samples
 
 CORNERS = tuple(Corner)
@@ -40,7 +40,7 @@ CLOCK_JUMP_S = 0.1
 EVERYWHERE = (True, True, True, True)
 
 
-class DangerMonitor(EmergencyRules):
+class DangerMonitor(SafetyRules):
     """Gives one verdict per sensors frame. Without ``health`` only edges, ages and emergencies are checked."""
 
     def __init__(
@@ -277,3 +277,9 @@ class DangerMonitor(EmergencyRules):
         if missing is not None:
             cause, permits = msgspec.structs.replace(cause, besides=missing.cause), NO_MOTION
         return Verdict(seq, t_s, row.code, cause, signal, value, limit, *permits, off=off)
+
+
+def survey_rules(cfg: Config) -> FrameRules:
+    """The rules of a configuration."""
+    monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
+    return FrameRules(monitor, lambda sensors, _raw, estimate: monitor.step(sensors, estimate))

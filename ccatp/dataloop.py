@@ -13,19 +13,20 @@ from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.config.models import RadioConfig
-from ccatp.beacons.sim.robot import BeaconRobot, build_beacon_robot
 from ccatp.config.files import read_key
 from ccatp.config.load import load_onboard_config
+from ccatp.config.mission import MissionConfig
 from ccatp.config.models import Config
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.core import DeckPose
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import build_mirror
+from ccatp.missions import kind_of
 from ccatp.onboard.robot import OnboardRobot
 from ccatp.onboard.server import TcpRobotServer
 from ccatp.onboard.sessions import ServerLog
@@ -35,6 +36,7 @@ from ccatp.sim.fault_proxy import FaultProxy, LinkFaults
 from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile, SurveyTruth
 from ccatp.sim.hardware import SimulatedHardware
 from ccatp.sim.robot import Robot
+from ccatp.sim.simulated_robot import SimulatedRobot
 
 _SAME_STEP = 1e-6  # tolerance for the rounding of times of steps and frames
 
@@ -47,7 +49,7 @@ def _hardware_class(cfg: Config) -> type[SimulatedHardware]:
     return PhysicsHardware
 
 
-class MotorRobot(OnboardRobot, SurveyTruth):
+class MotorRobot(OnboardRobot, SimulatedRobot, SurveyTruth):
     """A simulated survey robot whose motors are driven by the on-board core, just booted; simulated time."""
 
     injector = None  # only ``Robot`` has faults
@@ -86,17 +88,31 @@ class MotorRobot(OnboardRobot, SurveyTruth):
         self.delivered_seq, self._line = lines[0] if len(lines) == lines.maxlen else (-1, b"")
 
 
-AnyRobot = Robot | MotorRobot | BeaconRobot
+class StandInOptions(NamedTuple):
+    """What a simulated robot begins with: a plan of faults; the file that keeps its true pose between runs."""
+
+    faults: FaultPlan | None = None
+    body_file: Path | None = None
+    is_resuming: bool = False
+
+
+class StandIn(NamedTuple):
+    """A simulated robot, just booted; faults that it injects; what is done after each frame, and at the end."""
+
+    robot: SimulatedRobot
+    faults: Sequence[Injector] = ()
+    each_frame: Sequence[Callable[[], object]] = ()
+    close: Callable[[], object] = lambda: None
 
 
 class DataLoop(TcpRobotServer):
     """The server of one simulated robot. It logs the begin, end and effect of ``faults``, and a fall of the robot."""
 
-    robot: AnyRobot
+    robot: SimulatedRobot
 
     def __init__(
         self,
-        robot: AnyRobot,
+        robot: SimulatedRobot,
         *,
         lockstep: bool,
         key: bytes | None = None,
@@ -160,8 +176,25 @@ def _keep(file: SimPoseFile, robot: Robot | MotorRobot) -> None:
     file.keep(robot.seq, robot.world.plant)
 
 
+def survey_stand_in(cfg: Config, options: StandInOptions) -> StandIn:
+    """The simulated robot of a survey, where it stood last, or at base."""
+    body = None if options.body_file is None else SimPoseFile(options.body_file)
+    start = body.read() if body is not None and options.is_resuming else None
+    robot: Robot | MotorRobot
+    faults: list[Injector] = []
+    if cfg.sim.robot.physics != "lag":
+        robot = motor_robot(cfg, start)
+    else:
+        robot = survey_robot(cfg, options.faults, start)
+        if robot.injector is not None:
+            faults.append(robot.injector)
+    if body is None:
+        return StandIn(robot, faults)
+    return StandIn(robot, faults, (partial(_keep, body, robot),), body.close)
+
+
 async def serve(
-    cfg: Config | RadioConfig,
+    cfg: MissionConfig,
     *,
     lockstep: bool,
     stop: asyncio.Event,
@@ -178,24 +211,11 @@ async def serve(
     ``faults`` (survey robot only) may include faults of the link, for which a proxy listens instead of the robot.
     ``body_file`` keeps the true pose between runs. Raises ``zmq.ZMQError`` if an endpoint cannot be bound.
     """
-    robot: AnyRobot
-    at_work: list[Injector | LinkFaults] = []
-    each_frame: list[Callable[[], object]] = []
+    make: Callable[[Any, StandInOptions], StandIn] = kind_of(cfg).stand_in.get()
+    made = make(cfg, StandInOptions(faults, body_file, is_resuming))
+    robot, at_work = made.robot, list[Injector | LinkFaults](made.faults)
     async with AsyncExitStack() as stack:
-        if isinstance(cfg, RadioConfig):
-            robot = build_beacon_robot(cfg)
-        else:
-            body = None if body_file is None else SimPoseFile(body_file)
-            start = body.read() if body is not None and is_resuming else None
-            if cfg.sim.robot.physics != "lag":
-                robot = motor_robot(cfg, start)
-            else:
-                robot = survey_robot(cfg, faults, start)
-                if robot.injector is not None:
-                    at_work.append(robot.injector)
-            if body is not None:
-                stack.callback(body.close)
-                each_frame.append(partial(_keep, body, robot))
+        stack.callback(made.close)
         if faults is not None and faults.link:
             behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
             proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=listener)
@@ -204,7 +224,7 @@ async def serve(
         server = DataLoop(robot, lockstep=lockstep, key=read_key(cfg.robot.key_file), log=log, faults=at_work)
         truth = GroundTruthPublisher(robot, truth_rep, truth_pub)
         stack.callback(truth.close)
-        server.each_frame += [truth.add, *each_frame]
+        server.each_frame += [truth.add, *made.each_frame]
         await server.start(listener)
         async with asyncio.TaskGroup() as tasks:
             answering = tasks.create_task(truth.serve())

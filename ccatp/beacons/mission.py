@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
+from ccatp.beacons.conditions import MISSION_TOO_LONG
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.steering import HALT, SteeringCommand
-from ccatp.conditions import MISSION_TOO_LONG, Action
+from ccatp.conditions import Action
 from ccatp.core import Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import click
 
 import ccatp
-from ccatp.beacons.cli import radio
 from ccatp.cli import config, onboard, operate, prepare, recording, report, run, runs, sim, study
 from ccatp.cli.common import CommandGroup, example, run_command_line
+from ccatp.missions import built_in
 
 SECTIONS = {
     "Before a mission": (prepare.plan, prepare.check, prepare.calibrate, config.config, config.keys),
@@ -22,7 +22,7 @@ SECTIONS = {
         *(runs.runs, report.report, report.compare, report.align, report.replay, report.plot, recording.recording),
     ),
     "Simulation and robots": (sim.sim, onboard.onboard, sim.conformance),
-    "Studies": (study.study, study.bench, radio.radio),
+    "Studies": (study.study, study.bench, *(part.get() for kind in built_in() for part in kind.commands)),
     "Shell": (config.completion,),
 }
 

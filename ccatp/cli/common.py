@@ -375,9 +375,9 @@ def address_options(section: str) -> Callable[[Command], Command]:
 def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
     """The given runtime directory, or that of the only running daemon, or None. ConfigError: several daemons run."""
     if runtime_dir is None and config_file is not None:
-        from ccatp.daemon.process import processes_of, read_config
+        from ccatp.config.load import load_mission
 
-        configured = processes_of(read_config(config_file)).runtime_dir
+        configured = load_mission(config_file).processes.runtime_dir
         runtime_dir = Path(configured) if configured else None
     if runtime_dir is not None:
         return runtime_dir

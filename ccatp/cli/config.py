@@ -29,22 +29,19 @@ def config_check(file: Path) -> int:
 
     Check it on the machine where it will be used, because keys and tokens are files of this machine.
     """
-    from ccatp.config.models import Config
+    from ccatp.config.load import load_mission
     from ccatp.daemon.named_files import check_named_files
-    from ccatp.daemon.process import read_config
+    from ccatp.missions import kind_of
 
     try:
-        cfg = read_config(file)
+        cfg = load_mission(file)
         check_named_files(cfg, is_sim=True)  # without a robot it is not known whether its key is a secret
     except ConfigError as error:
         for problem in error.problems:
             common.complain(problem, error.exit_status)
         return error.exit_status
-    if isinstance(cfg, Config):
-        shown = f"mirror {cfg.mirror.name}, {cfg.mirror.panels.count} panels, world {cfg.world.name}"
-    else:
-        shown = f"system {cfg.system}"
-    click.echo(f"{file}: ok: {shown}, seed {cfg.run.seed}")
+    text = kind_of(cfg).text.get()(cfg)
+    click.echo(f"{file}: ok: {text.shown}, seed {cfg.run.seed}")
     return 0
 
 
@@ -76,10 +73,9 @@ def config_init(file: Path, force: bool) -> None:
 @common.json_option("As one JSON object.")
 def config_show(file: Path | None, settings: Mapping[str, object], json_output: bool) -> None:
     """Print the whole configuration that FILE and the defaults give, mirror and world included, as TOML."""
-    from ccatp.config.load import dump_config
-    from ccatp.daemon.process import read_config
+    from ccatp.config.load import dump_config, load_mission
 
-    cfg = read_config(file, settings)
+    cfg = load_mission(file, settings)
     click.echo(json.dumps(cfg.model_dump(mode="json")) if json_output else dump_config(cfg).rstrip())
 
 
@@ -92,11 +88,11 @@ def config_show(file: Path | None, settings: Mapping[str, object], json_output: 
 def config_diff(file: Path, other: Path | None, json_output: bool) -> None:
     """Show what FILE changes of the defaults for its mirror and world, or the changes from FILE to OTHER."""
     from ccatp.config.describe import differences
+    from ccatp.config.load import load_mission
     from ccatp.config.messages import format_value
-    from ccatp.daemon.process import read_config
 
-    cfg = read_config(file)
-    found = differences(cfg) if other is None else differences(read_config(other), cfg)
+    cfg = load_mission(file)
+    found = differences(cfg) if other is None else differences(load_mission(other), cfg)
     lines = [f"{k}: {format_value(before)} -> {format_value(after)}" for k, before, after in found]
     changes = {key: [before, after] for key, before, after in found}
     common.print_result(changes, lines or ["no difference"], json_output)

@@ -50,14 +50,11 @@ def sim_robot(
 
     Standard error says if it fell, and why; then the exit status is 4.
     """
-    from ccatp.config.load import is_radio_file, load_config, load_radio_config
+    from ccatp.config.load import load_mission
     from ccatp.daemon.sim_robot import run_alone
     from ccatp.sim.fault_plan import read_plan
 
-    if config_file is not None and is_radio_file(config_file):
-        among_beacons = load_radio_config(config_file, settings)
-        return int(run_alone(among_beacons, lockstep=not realtime, runtime_dir=runtime_dir))
-    cfg = load_config(config_file, settings)
+    cfg = load_mission(config_file, settings)
     plan = None if faults_file is None else read_plan(faults_file, lockstep=not realtime)
     return int(run_alone(cfg, lockstep=not realtime, faults=plan, runtime_dir=runtime_dir))
 

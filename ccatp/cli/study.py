@@ -62,7 +62,7 @@ def study(
     from ccatp.studies import limit_threads
 
     limit_threads()  # before numpy is imported
-    from ccatp.config import load as loaders
+    from ccatp.config.load import load_config
     from ccatp.studies import find_study
     from ccatp.studies.campaign import WHOLE, CampaignError, Study, parse_choice, parse_shard
     from ccatp.studies.engine import CampaignOptions, run_campaign
@@ -79,7 +79,7 @@ def study(
             if found.with_peers is None:
                 raise CampaignError(f"study {name} has no peers; leave --peers out")
             found = replace(found, cells=found.with_peers)
-        load = getattr(loaders, found.loader)
+        load = found.loader.get()
         result = run_campaign(found, lambda keys: load(config_file, keys), options)
     else:
         idle = {"--cluster": cluster, "--shard": shard, "--from": others, "--only": only, "--mirror": mirrors}
@@ -87,7 +87,7 @@ def study(
             raise CampaignError(f"study {name} has no runs to hand out; leave {surplus[0]} out")
         if runs or workers:
             click.echo(f"ccatp: study {name} is one analysis: --runs and --workers change nothing", err=True)
-        result = _analysed(found, loaders.load_config(config_file, settings), out)
+        result = _analysed(found, load_config(config_file, settings), out)
     common.print_lines([json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip()])
     return 0
 

@@ -4,19 +4,16 @@ import ipaddress
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
 from operator import mul
 from pathlib import PurePath
+from typing import Protocol
 
 from pydantic import BaseModel
 
-from ccatp.beacons.config.models import BeaconRobotConfig, CricketConfig, FuzzyConfig, RadioConfig
 from ccatp.config.messages import ConfigProblem, Key, choice_hint, slip_hint
-from ccatp.config.models import Config, DashboardConfig, MirrorConfig, RobotConfig
-from ccatp.config.onboard_models import OnboardConfig, OnboardRobotConfig
+from ccatp.config.models import Config, DashboardConfig, MirrorConfig
+from ccatp.config.onboard_models import OnboardConfig
 from ccatp.config.robot_limits import TOP_SPEED_M_S
-
-FUZZY_INPUTS = ("distance_m", "heading_error_rad")
 
 _LARGEST_LENGTH_M = 2.0  # no length outside the mirror's own files reaches it
 _SMALLEST_PANEL_MM = 10.0
@@ -29,10 +26,20 @@ _TCP_ENDPOINT = re.compile(r"tcp://[^\s/@;]+:(\d{1,5})")
 _LARGEST_PORT = 65535
 _CORNERS = {"front-left": (1, 1), "front-right": (1, -1), "rear-left": (-1, 1), "rear-right": (-1, -1)}
 _STEPS_OF_TIMER = 5  # of the control loop, in the time of the external timer: one may be late
-_ANCHORS = 2  # A is the origin, B shows the second axis
-_LEAST_NETWORK = 3  # motes of a stand that can trilaterate others in the plane
 
 Problems = Iterator[ConfigProblem]
+
+
+class DrivenWheels(Protocol):
+    """The wheels of a robot, as in its section of a configuration."""
+
+    @property
+    def wheel_radius_m(self) -> float:
+        """Radius of a wheel."""
+
+    @property
+    def max_wheel_rad_s(self) -> float:
+        """Largest rate of a wheel."""
 
 
 def check_config(cfg: Config) -> Problems:
@@ -47,25 +54,10 @@ def check_config(cfg: Config) -> Problems:
     yield from _check_wheels(cfg)
     yield from _check_world(cfg)
     yield from _check_network(cfg)
-    yield from _check_dashboard(cfg.dashboard)
+    yield from check_dashboard(cfg.dashboard)
     yield from _check_panels(cfg.mirror)
     yield from _check_gravity(cfg.mirror)
     yield from _check_collimators(cfg.mirror)
-
-
-def check_radio_config(cfg: RadioConfig, *, simulates: bool = True) -> Problems:
-    """Everything wrong with a configuration among beacons whose values are each in range.
-
-    ``simulates`` says whether the field of motes is simulated; layout and places do not matter for measured ranges.
-    """
-    yield from _check_top_speed(cfg.robot)
-    yield from _check_fuzzy(cfg.control.fuzzy)
-    yield from _check_follow(cfg)
-    if simulates:
-        yield from _check_layout(cfg.cricket)
-        yield from _check_places(cfg.cricket)
-    yield from _check_motes(cfg.cricket)
-    yield from _check_dashboard(cfg.dashboard)
 
 
 def is_file_name(name: str) -> bool:
@@ -73,15 +65,16 @@ def is_file_name(name: str) -> bool:
     return name.endswith(".toml") or "/" in name
 
 
-def _problem(key: str, what: str, *related: str) -> ConfigProblem:
+def problem_of(key: str, what: str, *related: str) -> ConfigProblem:
     """A problem of a dotted key, in which numbers are those of an array; ``related`` keys are dotted, too."""
     parts = tuple(int(part) if part.isdecimal() else part for part in key.split("."))
     return ConfigProblem(parts, what, tuple(tuple(other.split(".")) for other in related))
 
 
-def _choice(key: str, name: str, names: Iterable[str], kind: str) -> Problems:
+def check_choice(key: str, name: str, names: Iterable[str], kind: str) -> Problems:
+    """A problem if a key names what is not among ``names``."""
     if name not in (names := list(names)):
-        yield _problem(key, f'= "{name}" is no {kind}; {choice_hint(name, names)}')
+        yield problem_of(key, f'= "{name}" is no {kind}; {choice_hint(name, names)}')
 
 
 # -- surveys of mirrors -----------------------------------------------------------------------------------------------
@@ -89,23 +82,23 @@ def _choice(key: str, name: str, names: Iterable[str], kind: str) -> Problems:
 
 def _check_run(cfg: Config) -> Problems:
     if cfg.run.panels > (there := cfg.mirror.panels.count):
-        yield _problem(
+        yield problem_of(
             "run.panels", f"= {cfg.run.panels}, but {cfg.mirror.name} has {there} panels; 0 takes all of them"
         )
-    yield from _choice("control.gains", cfg.control.gains, cfg.control.gain_sets, "set of gains")
+    yield from check_choice("control.gains", cfg.control.gains, cfg.control.gain_sets, "set of gains")
     for section, named, found in ("mirror", cfg.run.mirror, cfg.mirror.name), ("world", cfg.run.world, cfg.world.name):
         if not is_file_name(named) and named != found:
             what = f'= "{found}", but run.{section} = "{PurePath(named)}"; name the same in both'
-            yield _problem(f"{section}.name", what, f"run.{section}")
+            yield problem_of(f"{section}.name", what, f"run.{section}")
     # Nothing is measured before the robot has stood still for long enough.
     settle_s, measuring_s = cfg.control.settle_time_s, cfg.etalon.measuring_time_s
     if settle_s + measuring_s < _LEAST_STANDSTILL_S:
         must = f"the robot must stand still for {_LEAST_STANDSTILL_S:g} s"
         what = f"= {measuring_s:g} is too short: with control.settle_time_s = {settle_s:g} {must}"
-        yield _problem("etalon.measuring_time_s", what, "control.settle_time_s")
+        yield problem_of("etalon.measuring_time_s", what, "control.settle_time_s")
     for name, light in cfg.align.light.items():
         if not any(light.direction_world):
-            yield _problem(f"align.light.{name}.direction_world", "= [0, 0, 0] is no direction")
+            yield problem_of(f"align.light.{name}.direction_world", "= [0, 0, 0] is no direction")
 
 
 def _slips(value: object, key: Key) -> Problems:
@@ -131,7 +124,7 @@ def check_onboard_config(cfg: OnboardConfig) -> Problems:
     full_scale_v = devices.daq.full_scale_v
     low_v, high_v = (edges.threshold_v + side * edges.hysteresis_v for side in (-0.5, 0.5))
     supply_v = devices.motors.supply_v
-    yield from _check_top_speed(robot)
+    yield from check_top_speed(robot)
     yield from _check_corners(robot.edge_sensors_m)
     step_s, lasting_s = 1.0 / servo.loop_hz, _STEPS_OF_TIMER / servo.loop_hz
     for is_wrong, key, what, *related in (
@@ -150,13 +143,13 @@ def check_onboard_config(cfg: OnboardConfig) -> Problems:
          "must be below devices.daq.battery_full_v", "devices.daq.battery_full_v"),
     ):  # fmt: skip
         if is_wrong:
-            yield _problem(key, what, *related)
+            yield problem_of(key, what, *related)
 
 
 def _check_wheels(cfg: Config) -> Problems:
     """The wheels must give the motion that the limits allow; edge sensors have x to the front, y to the left."""
     robot, limits = cfg.robot, cfg.limits
-    yield from _check_top_speed(robot)
+    yield from check_top_speed(robot)
     formula, related = "max_wheel_rad_s * wheel_radius_m", ("robot.max_wheel_rad_s", "robot.wheel_radius_m")
     rim_m_s = robot.max_wheel_rad_s * robot.wheel_radius_m
     turning_rad_s = 2.0 * rim_m_s / robot.wheel_base_m
@@ -166,17 +159,17 @@ def _check_wheels(cfg: Config) -> Problems:
     ):
         if value > limit:
             what = f"= {value:g} is more than the wheels give: {of} = {limit:.4g}"
-            yield _problem(key, what, *related, "robot.wheel_base_m")
+            yield problem_of(key, what, *related, "robot.wheel_base_m")
     yield from _check_corners(robot.edge_sensors_m)
 
 
-def _check_top_speed(robot: RobotConfig | BeaconRobotConfig | OnboardRobotConfig) -> Problems:
+def check_top_speed(robot: DrivenWheels) -> Problems:
     """The robot link refuses a robot that is too fast, and one with which no mission ends."""
     top_m_s = robot.max_wheel_rad_s * robot.wheel_radius_m
     low, high = TOP_SPEED_M_S
     if not low <= top_m_s <= high:
         what = f"= {robot.max_wheel_rad_s:g} is {top_m_s:.3g} m/s; the robot link allows {low:g} to {high:g}"
-        yield _problem("robot.max_wheel_rad_s", what, "robot.wheel_radius_m")
+        yield problem_of("robot.max_wheel_rad_s", what, "robot.wheel_radius_m")
 
 
 def _check_corners(edge_sensors_m: Sequence[tuple[float, float]]) -> Problems:
@@ -185,7 +178,7 @@ def _check_corners(edge_sensors_m: Sequence[tuple[float, float]]) -> Problems:
         if x * sign_x <= 0.0 or y * sign_y <= 0.0:
             where = f"x {'>' if sign_x > 0 else '<'} 0 and y {'>' if sign_y > 0 else '<'} 0"
             what = f"= [{x:g}, {y:g}] is not {corner}, where {where}; the order is {', '.join(_CORNERS)}"
-            yield _problem(f"robot.edge_sensors_m.{index}", what)
+            yield problem_of(f"robot.edge_sensors_m.{index}", what)
 
 
 def _check_world(cfg: Config) -> Problems:
@@ -193,17 +186,17 @@ def _check_world(cfg: Config) -> Problems:
     world, sim = cfg.world, cfg.sim.robot
     if world.slip_min > world.slip_max:
         what = f"= {world.slip_min:g} is more than slip_max = {world.slip_max:g}"
-        yield _problem("world.slip_min", what, "world.slip_max")
+        yield problem_of("world.slip_min", what, "world.slip_max")
     frame_s = 1.0 / sim.frame_hz
     for name in ("sensors_delay_s", "commands_delay_s"):
         delay_s = getattr(world, name)
         frames = delay_s * sim.frame_hz
         if abs(frames - round(frames)) > _WHOLE_FRAMES:
             what = f"= {delay_s:g} must be a whole number of frames of {frame_s:g} s"
-            yield _problem(f"world.{name}", what, "sim.robot.frame_hz")
+            yield problem_of(f"world.{name}", what, "sim.robot.frame_hz")
         elif delay_s and delay_s + frame_s > sim.ttl_s * (1.0 + _WHOLE_FRAMES):
             what = f"= {delay_s:g} and a frame of {frame_s:g} s outlast sim.robot.ttl_s = {sim.ttl_s:g}"
-            yield _problem(f"world.{name}", what, "sim.robot.ttl_s", "sim.robot.frame_hz")
+            yield problem_of(f"world.{name}", what, "sim.robot.ttl_s", "sim.robot.frame_hz")
 
 
 def is_loopback(host: str) -> bool:
@@ -220,27 +213,27 @@ def _check_network(cfg: Config) -> Problems:
     matched = _TCP_ENDPOINT.fullmatch(endpoint)
     if endpoint and (matched is None or int(matched[1]) > _LARGEST_PORT):
         what = f'= "{endpoint}" must be tcp://ADDRESS:PORT, or empty for the unix socket alone'
-        yield _problem("observatory.endpoint", what)
+        yield problem_of("observatory.endpoint", what)
     elif endpoint:
         for name in ("key_file", "clients_file"):
             if not getattr(cfg.observatory, name):
                 what = f'= "", but endpoint = "{endpoint}" wants keys and a list; see ccatp keys generate'
-                yield _problem(f"observatory.{name}", what, "observatory.endpoint")
+                yield problem_of(f"observatory.{name}", what, "observatory.endpoint")
     if cfg.sim.open_to_network:
         return
     hint = "set sim.open_to_network if everyone there may command it"
     if not (cfg.robot.key_file or is_loopback(host := cfg.sim.robot.host)):
         what = f'= "{host}" is beyond this machine; name a key in robot.key_file, or {hint}'
-        yield _problem("sim.robot.host", what)
+        yield problem_of("sim.robot.host", what)
     if not is_loopback(host := cfg.sim.etalon.host):
-        yield _problem("sim.etalon.host", f'= "{host}" is beyond this machine, and its protocol has no keys; {hint}')
+        yield problem_of("sim.etalon.host", f'= "{host}" is beyond this machine, and its protocol has no keys; {hint}')
 
 
-def _check_dashboard(dashboard: DashboardConfig) -> Problems:
+def check_dashboard(dashboard: DashboardConfig) -> Problems:
     """Whoever reaches the page may stop the robot, unless there is a token."""
     if not (is_loopback(dashboard.host) or dashboard.token_file):
         what = f'= "{dashboard.host}" is beyond this machine; name a file with a token in dashboard.token_file'
-        yield _problem("dashboard.host", what, "dashboard.token_file")
+        yield problem_of("dashboard.host", what, "dashboard.token_file")
 
 
 def _check_panels(mirror: MirrorConfig) -> Problems:
@@ -249,38 +242,38 @@ def _check_panels(mirror: MirrorConfig) -> Problems:
     for name in ("size_x_mm", "size_y_mm", "pitch_x_mm", "pitch_y_mm"):
         value = getattr(panels, name)
         if value < _SMALLEST_PANEL_MM:
-            yield _problem(f"{root}.{name}", f"= {value:g} looks like metres: {value:g} m are {value * 1e3:g} mm")
+            yield problem_of(f"{root}.{name}", f"= {value:g} looks like metres: {value:g} m are {value * 1e3:g} mm")
             return
     total, rows = sum(panels.panels_per_row), len(panels.panels_per_row)
     if total != panels.count:
         what = f"= {panels.count}, but panels_per_row adds up to {total}; correct one of them"
-        yield _problem(f"{root}.count", what, f"{root}.panels_per_row")
+        yield problem_of(f"{root}.count", what, f"{root}.panels_per_row")
     for row, n in enumerate(panels.panels_per_row):
         if n > panels.cols or (panels.cols - n) % 2:
             what = f"= {n} panels cannot be centred on cols = {panels.cols}; both even or both odd, and not more"
-            yield _problem(f"{root}.panels_per_row.{row}", what, f"{root}.cols")
+            yield problem_of(f"{root}.panels_per_row.{row}", what, f"{root}.cols")
     if base.row > rows:
-        yield _problem("mirror.base.row", f"= {base.row}, but there are {rows} rows")
+        yield problem_of("mirror.base.row", f"= {base.row}, but there are {rows} rows")
     else:
         n = panels.panels_per_row[base.row - 1]
         first = (panels.cols - n) // 2 + 1
         if not first <= base.col < first + n:
             what = f"= {base.col}: no panel stands there, row {base.row} has columns {first} to {first + n - 1}"
-            yield _problem("mirror.base.col", what)
+            yield problem_of("mirror.base.col", what)
     for axis in "xy":
         size, pitch = getattr(panels, f"size_{axis}_mm"), getattr(panels, f"pitch_{axis}_mm")
         half = size / 2.0
         if abs(pitch - size - panels.gap_mm) > _PITCH_AGREEMENT_MM:
             what = f"= {pitch:g} must be size + gap = {size + panels.gap_mm:g}"
-            yield _problem(f"{root}.pitch_{axis}_mm", what, f"{root}.size_{axis}_mm", f"{root}.gap_mm")
+            yield problem_of(f"{root}.pitch_{axis}_mm", what, f"{root}.size_{axis}_mm", f"{root}.gap_mm")
         low, middle, high = getattr(panels, f"points_{axis}_mm")
         if not -half < low < middle < high < half:
             what = f"= [{low:g}, {middle:g}, {high:g}] must ascend within the panel, {-half:g} to {half:g}"
-            yield _problem(f"{root}.points_{axis}_mm", what, f"{root}.size_{axis}_mm")
+            yield problem_of(f"{root}.points_{axis}_mm", what, f"{root}.size_{axis}_mm")
         value = getattr(base, f"{axis}_mm")
         if abs(value) >= half:
             what = f"= {value:g} is off the panel, which reaches from {-half:g} to {half:g}"
-            yield _problem(f"mirror.base.{axis}_mm", what)
+            yield problem_of(f"mirror.base.{axis}_mm", what)
 
 
 def _check_gravity(mirror: MirrorConfig) -> Problems:
@@ -290,105 +283,21 @@ def _check_gravity(mirror: MirrorConfig) -> Problems:
     normal = 0.0, -math.sin(angle_rad), math.cos(angle_rad)  # the mirror frame's z in the world
     falls_off = frame.reflecting_side_sign * sum(map(mul, normal, gravity))
     if abs(math.hypot(*gravity) - 1.0) > _UNIT_LENGTH:
-        yield _problem(key, f"= {list(gravity)} must be of length 1")
+        yield problem_of(key, f"= {list(gravity)} must be of length 1")
     elif (falls_off > 0.0) is not mirror.overhang:
         what = f"= {list(gravity)} contradicts overhang = {str(mirror.overhang).lower()}; give the direction of fall"
-        yield _problem(key, what, "mirror.overhang", "mirror.frame.reflecting_side_sign")
+        yield problem_of(key, what, "mirror.overhang", "mirror.frame.reflecting_side_sign")
 
 
 def _check_collimators(mirror: MirrorConfig) -> Problems:
     channels, positions = mirror.collimators.channels, mirror.collimators.positions_world_mm
     root = "mirror.collimators"
     if len(set(channels)) != len(channels):
-        yield _problem(f"{root}.channels", f"= {list(channels)} names a channel twice")
+        yield problem_of(f"{root}.channels", f"= {list(channels)} names a channel twice")
     if len(channels) != len(positions):
         what = f"has {len(positions)} positions for {len(channels)} channels"
-        yield _problem(f"{root}.positions_world_mm", what, f"{root}.channels")
+        yield problem_of(f"{root}.positions_world_mm", what, f"{root}.channels")
     for index, position in enumerate(positions):
         if (distance_mm := math.hypot(*position)) < _NEAREST_COLLIMATOR_MM:
             what = f"= {list(position)} is {distance_mm:.3g} mm from the world's origin; looks like metres"
-            yield _problem(f"{root}.positions_world_mm.{index}", what)
-
-
-# -- robots among radio beacons ---------------------------------------------------------------------------------------
-
-
-def _check_fuzzy(fuzzy: FuzzyConfig) -> Problems:
-    root = "control.fuzzy"
-    for name, given in fuzzy.inputs.items():
-        if name not in FUZZY_INPUTS:
-            yield _problem(f"{root}.inputs.{name}", f"is no input of the speed; {choice_hint(name, FUZZY_INPUTS)}")
-        for term, corners in given.terms.items():
-            if list(corners) != sorted(corners):
-                what = f"= {list(corners)} must rise: left foot, left shoulder, right shoulder, right foot"
-                yield _problem(f"{root}.inputs.{name}.terms.{term}", what)
-    for index, rule in enumerate(fuzzy.rules):
-        key = f"{root}.rules.{index}"
-        yield from _choice(f"{key}.then", rule.then, fuzzy.outputs, "output")
-        for name, term in rule.when.items():
-            if name not in fuzzy.inputs:
-                yield _problem(f"{key}.when", f'names "{name}", no input; {choice_hint(name, fuzzy.inputs)}')
-            else:
-                yield from _choice(f"{key}.when.{name}", term, fuzzy.inputs[name].terms, "term of it")
-
-
-def _check_follow(cfg: RadioConfig) -> Problems:
-    follow, avoidance = cfg.follow, cfg.avoidance
-    if follow.is_active and follow.target in cfg.sim.beacons:
-        what = f'= "{follow.target}" is also a static beacon of sim.beacons; give the radio that moves its own name'
-        yield _problem("follow.target", what)
-    for key, value, limit, most in (
-        ("follow.band_m", follow.band_m, "follow.safe_distance_m", follow.safe_distance_m),
-        ("avoidance.stop_m", avoidance.stop_m, "avoidance.influence_m", avoidance.influence_m),
-    ):
-        if value >= most:
-            yield _problem(key, f"= {value:g} must be less than {limit} = {most:g}", limit)
-    width_m, height_m = cfg.workspace.size_m
-    for index, (x_m, y_m) in enumerate(cfg.workspace.waypoints_m):
-        if not (0.0 <= x_m <= width_m and 0.0 <= y_m <= height_m):
-            what = f"= [{x_m:g}, {y_m:g}] lies outside the room of {width_m:g} by {height_m:g} m"
-            yield _problem(f"workspace.waypoints_m.{index}", what, "workspace.size_m")
-
-
-def _check_layout(cfg: CricketConfig) -> Problems:
-    stands, anchors, stand = len(cfg.networks), len(cfg.anchors), len(cfg.stand_m)
-    found = (
-        ("motes", len(cfg.motes) < 2, "motes", f"has {len(cfg.motes)}; a map needs two"),
-        ("networks", cfg.dimension != 2, "dimension", '= 3 needs layout = "motes" or "random"; stands lie in a plane'),
-        ("networks", stands < 2, "networks", f"has {stands}; phase 1 goes from one network to the next"),
-        ("networks", anchors != _ANCHORS, "anchors",
-         f"has {anchors} motes, not {_ANCHORS}: the origin and the axis"),
-        ("networks", stand < _LEAST_NETWORK, "stand_m", f"has {stand} motes; trilateration needs {_LEAST_NETWORK}"),
-    )  # fmt: skip
-    for layout, is_wrong, name, what in found:
-        if is_wrong and cfg.layout == layout:
-            yield _problem(f"cricket.{name}", what)
-
-
-def _check_places(cfg: CricketConfig) -> Problems:
-    given: list[tuple[str, tuple[float, ...]]] = []
-    motes = {"networks": cfg.networks, "motes": cfg.motes, "random": {}}[cfg.layout]
-    if cfg.layout == "random":
-        given += [("random.size_m", cfg.random.size_m)]
-    elif cfg.layout == "networks":
-        given += [(f"stand_m.{number}", place) for number, place in enumerate(cfg.stand_m)]
-        given += [(f"anchors.{name}", place) for name, place in cfg.anchors.items()]
-    for name, mote in motes.items():
-        key = f"{cfg.layout}.{name}"
-        given += [(f"{key}.place_m", mote.place_m), (f"{key}.facing", mote.facing)]
-        if not any(mote.facing):
-            yield _problem(f"cricket.{key}.facing", "is no direction: all its parts are 0")
-    for key, coordinates in given:
-        if len(coordinates) != cfg.dimension:
-            wanted = f"cricket.dimension = {cfg.dimension} asks for {cfg.dimension}"
-            yield _problem(f"cricket.{key}", f"has {len(coordinates)} coordinates, {wanted}")
-
-
-def _check_motes(cfg: CricketConfig) -> Problems:
-    angles, reaches = cfg.transducer.off_axis_rad, cfg.transducer.reach_m
-    root = "cricket.transducer"
-    if len(angles) != len(reaches):
-        what = f"has {len(reaches)} values for {len(angles)} angles of off_axis_rad"
-        yield _problem(f"{root}.reach_m", what, f"{root}.off_axis_rad")
-    if angles[0] != 0.0 or any(later <= before for before, later in pairwise(angles)):
-        yield _problem(f"{root}.off_axis_rad", f"= {list(angles)} must begin with 0 and rise")
+            yield problem_of(f"{root}.positions_world_mm.{index}", what)

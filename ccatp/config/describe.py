@@ -4,14 +4,15 @@ The comments in the shipped files are the only place where a key is described; h
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.files import read_toml
-from ccatp.config.load import DEFAULT_FILE, available, load_config, load_radio_config
+from ccatp.config.load import DEFAULT_FILE, available, load_config
+from ccatp.config.mission import MissionConfig
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
+from ccatp.missions import kind_of
 
 # A file that describes every key, and the section that it is.
 _DESCRIBED = {DEFAULT_FILE: "", "mirrors/fyst-m1.toml": "mirror", "worlds/hard.toml": "world"}
@@ -78,19 +79,20 @@ def template() -> str:
     return _HEAD + "\n" + "".join(f"# {line}\n" if re.match(r"[\w-]+ = ", line) else f"{line}\n" for line in body)
 
 
-def differences(
-    cfg: Config | RadioConfig, other: Config | RadioConfig | None = None
-) -> list[tuple[str, object, object]]:
+def shipped_config(cfg: Config) -> Config:
+    """The shipped configuration of the same mirror and world, where these are shipped."""
+    names = {"mirror": cfg.mirror.name, "world": cfg.world.name}
+    shipped = {f"run.{kind}": name for kind, name in names.items() if name in available(kind)}
+    return load_config(None, shipped).model_copy(update={"run": load_config().run})
+
+
+def differences(cfg: MissionConfig, other: MissionConfig | None = None) -> list[tuple[str, object, object]]:
     """Dotted key, value in ``other``, and value in ``cfg``; None where there is none.
 
-    Without ``other`` the shipped configuration: of the same mirror and world, where these are shipped, or system.
+    Without ``other`` the shipped configuration that is nearest, as of the same mirror and world.
     """
-    if isinstance(cfg, RadioConfig):
-        other = other or load_radio_config(None, {"system": cfg.system})
-    elif other is None:
-        names = {"mirror": cfg.mirror.name, "world": cfg.world.name}
-        shipped = {f"run.{kind}": name for kind, name in names.items() if name in available(kind)}
-        other = load_config(None, shipped).model_copy(update={"run": load_config().run})
+    shipped: Callable[[Any], MissionConfig] = kind_of(cfg).shipped.get()
+    other = other or shipped(cfg)
     before, after = dict(_leaves(other.model_dump(mode="json"))), dict(_leaves(cfg.model_dump(mode="json")))
     keys = dict.fromkeys((*before, *after))
     return [(key, before.get(key), after.get(key)) for key in keys if before.get(key) != after.get(key)]

@@ -7,12 +7,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from ccatp.beacons.config.models import RadioConfig, RecordingsConfig
-from ccatp.config.checks import check_config, check_onboard_config, check_radio_config, is_file_name
+from ccatp.config.checks import check_config, check_onboard_config, is_file_name
 from ccatp.config.files import read_toml
 from ccatp.config.messages import (
     ConfigProblem,
@@ -25,19 +24,19 @@ from ccatp.config.messages import (
     format_value,
     parse_toml,
 )
+from ccatp.config.mission import MissionConfig
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
+from ccatp.missions import SURVEY, MissionKind, all_kinds, find_kind
 
 Tree = dict[str, Any]
 Overrides = Mapping[str, object] | None
 M = TypeVar("M", bound=BaseModel)
 Check = Callable[[M], Iterable[ConfigProblem]]
 
-DEFAULT_FILE, BEACON_FILE, RECORDING_FILE = "ccatp.toml", "radio.toml", "recordings.toml"
-ONBOARD_FILE = "onboard.toml"
-SYSTEMS = ("zigbee", "follow", "cricket")
+DEFAULT_FILE, ONBOARD_FILE = "ccatp.toml", "onboard.toml"
 _RUN_FILE = "config.toml"  # of a run directory
 # Of a run's file. Its last line has the checksum of all before: what is missing would be taken from the defaults.
 _RUN_HEAD = "# The exact configuration of one run, to its last line; ccatp run --config FILE repeats it.\n\n"
@@ -50,21 +49,13 @@ _SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
     "mirror": ("mirrors", MirrorConfig),
     "world": ("worlds", WorldConfig),
 }
-# A file that names its own beacons means these and no others; on the command line one may be moved.
-_WHOLE: tuple[Key, ...] = (
-    ("sim", "beacons"),
-    ("path_loss", "reference_dbm_of"),
-    ("cricket", "networks"),
-    ("cricket", "motes"),
-    ("cricket", "anchors"),
-)
 _MOST_PROBLEMS = 10  # that one error lists
 # In comments: a stand-in value, and what takes its place.
 UNVERIFIED, MEASURED = "UNVERIFIED", "measured by ccatp calibrate"
 
 
 class NotASurvey(ConfigError):
-    """A configuration of a mission among beacons where one of a survey is wanted."""
+    """A configuration of another kind of mission where one of a survey is wanted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +112,7 @@ def merged(
     return tree
 
 
-def _layers(base: str, file: Path | None, overrides: Overrides, *, any_ports: bool = False) -> list[ConfigSource]:
+def layers(base: str, file: Path | None, overrides: Overrides, *, any_ports: bool = False) -> list[ConfigSource]:
     """Command line, the user's file, base: the strongest first."""
     user = read_source(file) if file else ConfigSource("", "", {})
     if file is not None:
@@ -161,7 +152,7 @@ def _checksum(body: str) -> str:
     return _CHECKSUM.format(zlib.crc32(body.encode()))
 
 
-def _strongest(sources: list[ConfigSource], *keys: Key) -> tuple[ConfigSource, Key]:
+def strongest(sources: list[ConfigSource], *keys: Key) -> tuple[ConfigSource, Key]:
     """Of contradicting keys the one from the strongest source, and this source."""
     held: list[tuple[ConfigSource, Key]] = []
     for key in keys:
@@ -172,7 +163,7 @@ def _strongest(sources: list[ConfigSource], *keys: Key) -> tuple[ConfigSource, K
 
 def _place(sources: list[ConfigSource], *keys: Key) -> str:
     """``file:line`` of the key from the strongest source."""
-    source, key = _strongest(sources, *keys)
+    source, key = strongest(sources, *keys)
     return source.place(key)
 
 
@@ -210,13 +201,14 @@ def load_config(file: Path | None = None, overrides: Overrides = None, *, any_po
     ``[mirror]`` and ``[world]``, as a run directory holds, is taken as it is, and single keys of these sections are
     laid over the named file. Dotted keys in ``overrides`` are stronger than the file; ``None`` values are left out.
     ``any_ports``: the simulated servers take any free port unless file or overrides name one. ConfigError: one line
-    with file, line, key, what is wrong and what to do; NotASurvey: the file is of a mission among beacons.
+    with file, line, key, what is wrong and what to do; NotASurvey: the file is of another kind of mission.
     """
-    command, user, base = sources = _layers(DEFAULT_FILE, file, overrides, any_ports=any_ports)
-    system = user.tree.get("system")
-    if file is not None and system is not None:
+    command, user, base = sources = layers(DEFAULT_FILE, file, overrides, any_ports=any_ports)
+    system = user.tree.pop("system", SURVEY)
+    if file is not None and system != SURVEY:
+        kind = find_kind(system)
         use = f"ccatp report {file.parent}" if file.name == _RUN_FILE else "ccatp run or ccatp study with it"
-        what = f"{file}: is of a mission among beacons (system = {format_value(system)})"
+        what = f"{file}: is of a {kind.title if kind else 'mission'} (system = {format_value(system)})"
         raise NotASurvey(f"{what}, and this is for surveys of mirrors alone; use {use}")
     tree = merged(merged(base.tree, user.tree), command.tree)
     problems: list[str] = []
@@ -230,7 +222,7 @@ def load_config(file: Path | None = None, overrides: Overrides = None, *, any_po
     return validated(Config, tree, sources, check_config)
 
 
-def dump_config(cfg: Config | RadioConfig) -> str:
+def dump_config(cfg: MissionConfig) -> str:
     """The complete configuration as TOML; the loader of its kind gives an equal one."""
     import tomlkit  # noqa: PLC0415 - only a command that writes a file needs it, and every process reads one
 
@@ -265,7 +257,7 @@ def _section(section: str, tree: Tree, sources: list[ConfigSource]) -> Tree:
 
 def _read_named(section: str, run: object, sources: list[ConfigSource]) -> ConfigSource:
     """The file that ``run.mirror`` or ``run.world`` names."""
-    source, key = _strongest(sources, ("run", section))
+    source, key = strongest(sources, ("run", section))
     if not isinstance(run, Mapping):
         raise ConfigError(f"{source.place(key)}: run = {format_value(run)} must be a section, not a value")
     name = run.get(section)
@@ -287,54 +279,46 @@ def _read_named(section: str, run: object, sources: list[ConfigSource]) -> Confi
         raise refusal(f": {error}") from error
 
 
-# -- robots among radio beacons ---------------------------------------------------------------------------------------
+# -- any kind of mission -----------------------------------------------------------------------------------------------
 
 
-def load_radio_config(
-    file: Path | None = None, overrides: Overrides = None, *, simulates: bool = True, any_ports: bool = False
-) -> RadioConfig:
-    """The whole configuration of a robot among radio beacons; arguments as in ``load_config``.
+class LoadConfig(Protocol):
+    """Loads a configuration of one kind, as ``load_config``."""
 
-    ``system`` of the user's file, else of the base file ``radio.toml``, says which of ``zigbee.toml``, ``follow.toml``
-    and ``cricket.toml`` lies between the two. ``simulates`` says whether a field of motes is simulated, or its ranges
-    were measured.
+    def __call__(self, file: Path | None = None, overrides: Overrides = None, *, any_ports: bool = False) -> Any:
+        """The configuration; ConfigError: one line with file, line, key, what is wrong and what to do."""
+
+
+def kind_in(file: Path | None, overrides: Overrides = None) -> MissionKind:
+    """The kind of mission of a configuration: that of ``system`` on the command line, else in the file.
+
+    Raises ConfigError: there is no such kind, or the file cannot be read.
     """
-    command, user, base = sources = _layers(BEACON_FILE, file, overrides, any_ports=any_ports)
-    run = user.tree.get("run")
-    named = set(user.tree) | (set(run) if isinstance(run, Mapping) else set())
-    if "system" not in user.tree and {"mirror", "world"} & named:  # which only surveys have
-        raise ConfigError(
-            f"{file}: is the configuration of a survey of a mirror; give that of a robot among beacons, as cricket.toml"
-        )
-    source, key = _strongest(sources, ("system",))
-    name = source.tree.get("system")
-    if name is None:
-        raise ConfigError(f"{base.name}: system is missing; {choice_hint('', SYSTEMS)}")
-    if name not in SYSTEMS:
-        hint = choice_hint(str(name), SYSTEMS)
-        raise ConfigError(f"{source.place(key)}: system = {format_value(name)} is no system; {hint}")
-    system = read_source(configs_dir() / f"{name}.toml")
-    tree = merged(merged(base.tree, system.tree, _WHOLE), user.tree, _WHOLE)
-    sources = [command, user, system, base]
-    return validated(
-        RadioConfig, merged(tree, command.tree), sources, lambda cfg: check_radio_config(cfg, simulates=simulates)
-    )
+    command = ConfigSource("command line", "", nested(overrides or {}))
+    sources = [command] if file is None else [command, read_source(file)]
+    source, key = strongest(sources, ("system",))
+    system = source.tree.get("system", SURVEY)
+    kind = find_kind(system)
+    if kind is None:
+        names = [name for one in all_kinds() for name in one.systems]
+        shown = format_value(system)
+        raise ConfigError(f"{source.place(key)}: system = {shown} is no system; {choice_hint(str(system), names)}")
+    return kind
 
 
-def is_radio_file(file: Path) -> bool:
-    """Whether a configuration file is one of a robot among beacons: it names its ``system``; errors as of loading."""
-    return "system" in read_source(file).tree
+def load_mission(file: Path | None = None, overrides: Overrides = None, *, any_ports: bool = False) -> MissionConfig:
+    """The configuration of any kind of mission; arguments and errors as of ``load_config`` and ``kind_in``."""
+    load: LoadConfig = kind_in(file, overrides).load.get()
+    cfg: MissionConfig = load(file, overrides, any_ports=any_ports)
+    return cfg
 
 
-def load_recordings_config(file: Path | None = None, overrides: Overrides = None) -> RecordingsConfig:
-    """What is assumed of recorded radio data, by format, as in ``plaza.priors.range_scale``; errors as above."""
-    command, user, base = sources = _layers(RECORDING_FILE, file, overrides)
-    return validated(RecordingsConfig, merged(merged(base.tree, user.tree), command.tree), sources)
+# -- the on-board program ----------------------------------------------------------------------------------------------
 
 
 def load_onboard_config(file: Path | None = None, overrides: Overrides = None) -> OnboardConfig:
     """The configuration of the on-board program; errors as of ``load_config``."""
-    command, user, base = sources = _layers(ONBOARD_FILE, file, overrides)
+    command, user, base = sources = layers(ONBOARD_FILE, file, overrides)
     tree = merged(merged(base.tree, user.tree), command.tree)
     return validated(OnboardConfig, tree, sources, check_onboard_config)
 

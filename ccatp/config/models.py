@@ -1,6 +1,6 @@
 """Frozen configuration models. Values live in ``configs/``; nothing here has a default with a unit."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -575,6 +575,7 @@ class MirrorConfig(Model):
 class Config(Model):
     """The whole configuration of one run. ``mirror`` and ``world`` are the files that ``run`` names, read in."""
 
+    system: ClassVar[str] = "survey"
     run: RunConfig
     observation: SurveyMetadata
     robot: RobotConfig
@@ -592,3 +593,8 @@ class Config(Model):
     sim: SimConfig
     mirror: MirrorConfig
     world: WorldConfig
+
+    @property
+    def processes(self) -> ProcessesConfig:
+        """Time-outs, restarts and priorities of the processes."""
+        return self.run

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple, cast
 import msgspec
 import structlog
 
-from ccatp.conditions import OPERATOR, TABLE, text_of
+from ccatp.conditions import OPERATOR, find_condition, text_of
 from ccatp.config.files import read_text
 from ccatp.core import Cause, Severity
 from ccatp.links.topics import Alarm, SeverityName
@@ -45,7 +45,7 @@ class ActiveCause(NamedTuple):
 
 def active_cause(cause: Cause) -> ActiveCause:
     """A cause with the severity of its row; that of a condition that is not known here is the highest."""
-    row = TABLE.get(cause.condition)
+    row = find_condition(cause.condition)
     return ActiveCause(cause.condition, text_of(cause), Severity.FAULT if row is None else row.alarm_severity)
 
 
@@ -149,7 +149,7 @@ class AlarmList:
     def _apply(self, event: AlarmEvent) -> None:
         name, known = event.name, self._alarms.get(event.name)
         if event.event == "raised":
-            row = TABLE.get(name)
+            row = find_condition(name)
             alarm = Alarm(
                 name=name,
                 severity=event.severity,

@@ -12,14 +12,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple, Protocol, TypeVar
 
-from ccatp.beacons.config.models import RadioConfig, SimBeaconRobotConfig
-from ccatp.config.models import Config, DashboardConfig, ProcessesConfig, SimEtalonConfig, SimRobotConfig
+from ccatp.config.load import load_mission
+from ccatp.config.mission import MissionConfig
+from ccatp.config.models import DashboardConfig, ProcessesConfig
 from ccatp.config.package import child_environment
-from ccatp.daemon.process import SUPERVISOR_PID, listen_at, read_config, run_dir_in
+from ccatp.daemon.process import SUPERVISOR_PID, listen_at, run_dir_in
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import Heartbeat
+from ccatp.missions import kind_of
 from ccatp.report.dashboard.access import TOKEN_FILE
 
 # Exit statuses after which a restart would end in the same way; the process has reported the reason.
@@ -304,21 +306,36 @@ def page_address(runtime_dir: Path) -> str:
     if run_dir is None or not (runtime_dir / "dashboard").exists():
         return ""
     with suppress(ConfigError):  # the run directory was removed
-        cfg = read_config(run_dir / "config.toml").dashboard
+        cfg = load_mission(run_dir / "config.toml").dashboard
         return page_url(cfg.host, cfg.port) + token_query(cfg, runtime_dir)
     return ""
 
 
-SimulatedServer = SimRobotConfig | SimEtalonConfig | SimBeaconRobotConfig
+class ServerAddress(Protocol):
+    """Where a simulated server listens."""
+
+    @property
+    def host(self) -> str:
+        """Address."""
+
+    @property
+    def port(self) -> int:
+        """Port; 0 takes any free one."""
 
 
-def simulated_servers(cfg: Config | RadioConfig) -> list[tuple[str, str, SimulatedServer]]:
+def process_table(cfg: MissionConfig) -> tuple[ProcessSpec, ...]:
+    """The processes of a run of a configuration, in the order of starting."""
+    table: tuple[ProcessSpec, ...] = kind_of(cfg).processes.get()
+    return table
+
+
+def simulated_servers(cfg: MissionConfig) -> list[tuple[str, str, ServerAddress]]:
     """Process, section of the configuration and address of each simulated server."""
-    servers: list[tuple[str, str, SimulatedServer]] = [("dataloop", "sim.robot", cfg.sim.robot)]
-    return servers if isinstance(cfg, RadioConfig) else [*servers, ("etalon", "sim.etalon", cfg.sim.etalon)]
+    servers = [one for one in process_table(cfg) if one.is_simulator]
+    return [(one.name, one.listens, getattr(cfg.sim, one.listens.removeprefix("sim."))) for one in servers]
 
 
-C = TypeVar("C", bound=Config | RadioConfig)
+C = TypeVar("C", bound=MissionConfig)
 
 
 def with_addresses(cfg: C, sockets: Mapping[str, socket.socket]) -> C:
@@ -331,4 +348,4 @@ def with_addresses(cfg: C, sockets: Mapping[str, socket.socket]) -> C:
         host, port = sockets[process].getsockname()[:2]
         name = section.removeprefix("sim.")
         changes[name] = getattr(cfg, name).model_copy(update={"host": host, "port": port})
-    return cast(C, cfg.model_copy(update=changes))
+    return cfg.model_copy(update=changes)

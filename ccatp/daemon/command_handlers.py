@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import structlog
 import zmq.asyncio
@@ -15,11 +14,7 @@ from ccatp.links.auth import AuthorizedClient, ClientsFile, KeyPair, read_client
 from ccatp.links.channels import format_error, parse_reply
 from ccatp.links.liveness import LogRateLimit
 from ccatp.links.rpc import Router, ZapHandler
-from ccatp.safety.emergency_latch import answer_observatory
-
-if TYPE_CHECKING:
-    from ccatp.beacons.safety.rules import BeaconSafetyRules
-    from ccatp.danger import DangerMonitor
+from ccatp.safety.emergency_latch import EmergencyRules, answer_observatory
 
 KEY_FILE, CLIENTS_FILE = "observatory.key_file", "observatory.clients_file"
 # Only the daemon's own user can use the unix socket, and this user could also stop the daemon.
@@ -39,7 +34,7 @@ class ObservatoryServer:
         self,
         local_endpoint: str,
         cfg: ObservatoryConfig,
-        monitor: "DangerMonitor | BeaconSafetyRules",
+        monitor: EmergencyRules,
         age_s: Callable[[], float | None],
         log: structlog.typing.FilteringBoundLogger,
     ) -> None:

@@ -9,7 +9,7 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,47 +17,21 @@ from typing import Any
 import structlog
 import zmq
 
-from ccatp.beacons.config.models import RadioConfig
-from ccatp.beacons.links.messages import decode_beacon_frame
-from ccatp.beacons.safety.rules import BeaconSafetyRules
 from ccatp.conditions import text_of
 from ccatp.config.files import read_text, sync_folder
-from ccatp.config.models import Config
 from ccatp.core import NO_CAUSE, Cause, EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.alarms import ActiveCause, active_cause
 from ccatp.daemon.command_handlers import ObservatoryServer
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import RobotLoop
-from ccatp.danger import DangerMonitor
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import EstimateSubscriber
 from ccatp.links.frame_answers import PermitRule
-from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello, Sensors
-from ccatp.links.topics import DangerEvent, EstimateMessage
-from ccatp.mirror.mirror import build_mirror
+from ccatp.links.topics import DangerEvent
+from ccatp.missions import kind_of
 from ccatp.safety.emergency_latch import Emergency, EmergencyLatch
-
-Judge = Callable[[Sensors, bytes, EstimateMessage | None], Verdict]
-
-
-def build_safety_monitor(cfg: Config | RadioConfig) -> tuple[DangerMonitor | BeaconSafetyRules, Judge]:
-    """The safety monitor of a configuration, and the function that judges a frame, its line and main's estimate."""
-    if isinstance(cfg, RadioConfig):
-        rules = BeaconSafetyRules(cfg)
-
-        def judge(sensors: Sensors, raw: bytes, estimate: EstimateMessage | None) -> Verdict:
-            try:
-                extras = decode_beacon_frame(raw)
-            except BadLine:
-                # Without the distances, obstacles are not known.
-                return rules.stale(sensors.seq, sensors.t)
-            return rules.step(sensors, extras, estimate)
-
-        return rules, judge
-    monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
-    return monitor, lambda sensors, _raw, estimate: monitor.step(sensors, estimate)
-
+from ccatp.safety.rules import FrameRules
 
 FILE = "emergencies.json"
 # Enough for some hundred active emergencies and as many cleared ones.
@@ -147,7 +121,8 @@ class DangerLoop(RobotLoop):
     def __init__(self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         super().__init__("danger", "monitor", args, context)
         self._cfg = cfg = args.config
-        self.monitor, self._judge = build_safety_monitor(cfg)
+        made: FrameRules = kind_of(cfg).rules.get()(cfg)
+        self.monitor, self._judge = made
         self.monitor.latch = PersistentEmergencyLatch(args.run_dir / FILE, self.log)
         self.peer = self._estimates = EstimateSubscriber(
             context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over

@@ -9,7 +9,6 @@ import os
 import socket
 import sys
 from collections.abc import Callable, Coroutine, Mapping
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,25 +16,22 @@ from typing import Any
 import structlog
 import zmq
 
-from ccatp.beacons.config.models import RadioConfig
-from ccatp.config.models import Config
+from ccatp.config.load import load_mission
+from ccatp.config.mission import MissionConfig
 from ccatp.daemon.child_processes import open_page_socket, token_query
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
-from ccatp.daemon.process import Endpoints, open_log, read_config, run_dir_in, run_until_stopped, start_process
+from ccatp.daemon.process import Endpoints, open_log, run_dir_in, run_until_stopped, start_process
 from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.bus import HeartbeatPublisher, Publisher
 from ccatp.links.liveness import LogRateLimit
 from ccatp.links.runtime_dir import runtime_dir_path
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.missions import kind_of
 from ccatp.records.recorder import TELEMETRY, read_metadata, recordings
-from ccatp.records.store import StoreError, read_survey
 from ccatp.report.dashboard.access import page_tokens
 from ccatp.report.dashboard.app import CommandEndpoint, build_app, serve
 from ccatp.report.dashboard.history import replay
-from ccatp.report.dashboard.hub import BEACONS, SURVEY, BusReader, StateBroadcaster
-from ccatp.report.dashboard.survey_view import SurveyView
-from ccatp.report.dashboard.survey_view import ground as survey_ground
-from ccatp.report.dashboard.view import RunStateView, run_ground
+from ccatp.report.dashboard.hub import BusReader, Page, StateBroadcaster
+from ccatp.report.dashboard.view import run_ground
 
 Logger = structlog.typing.FilteringBoundLogger
 HEARTBEAT_PERIOD_S = 0.5
@@ -43,7 +39,7 @@ ROOT = "dashboard."
 
 
 async def serve_page(
-    cfg: Config | RadioConfig,
+    cfg: MissionConfig,
     run_dir: Path,
     endpoints: Endpoints,
     listener: socket.socket,
@@ -60,20 +56,8 @@ async def serve_page(
     """
     settings, is_over = cfg.dashboard, asyncio.Event()
     tokens = page_tokens(settings, endpoints.runtime_dir)
-    view: RunStateView
-    past: RunStateView
-    if isinstance(cfg, RadioConfig):
-        # Imported late: a survey does not need it, and its libraries are large.
-        from ccatp.beacons.report.dashboard.view import BeaconView, beacon_ground  # noqa: PLC0415
-
-        view, wants = BeaconView(cfg, is_sim=is_sim, run_dir=run_dir), BEACONS
-        past = BeaconView(cfg, is_sim=is_sim)
-        ground = beacon_ground(cfg, is_sim=is_sim)
-    else:
-        mirror = build_mirror(cfg.mirror)
-        view, wants = _survey_view(mirror, cfg, run_dir, is_sim=is_sim), SURVEY
-        past = SurveyView(mirror, cfg, is_sim=is_sim)
-        ground = survey_ground(mirror, cfg, is_sim=is_sim)
+    make: Callable[[Any, Path, bool], Page] = kind_of(cfg).page.get()
+    view, past, ground, wants = make(cfg, run_dir, is_sim)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     reader = BusReader(context, endpoints.of, view, is_sim=is_sim, wants=wants)
     hub = StateBroadcaster(reader, view, settings.rate_hz)
@@ -110,13 +94,6 @@ async def _send_heartbeats(context: zmq.Context[zmq.Socket[bytes]], endpoints: E
     while True:
         heartbeat.publish()
         await asyncio.sleep(HEARTBEAT_PERIOD_S)
-
-
-def _survey_view(mirror: Mirror, cfg: Config, run_dir: Path, *, is_sim: bool) -> SurveyView:
-    view = SurveyView(mirror, cfg, is_sim=is_sim, run_dir=run_dir)
-    with suppress(StoreError):  # nothing has been measured yet
-        view.begin_with(read_survey(run_dir / "mission.sqlite", mirror.name))
-    return view
 
 
 def _run(run_dir: Path, serve_until: Callable[[asyncio.Event, Logger], Coroutine[Any, Any, None]]) -> int:
@@ -172,7 +149,7 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], report: Cal
         raise DaemonUnreachableError(
             f"no daemon in {folder}; start one with ccatp run, or name its folder with --runtime-dir"
         )
-    cfg = read_config(run_dir / "config.toml", {**settings, f"{ROOT}enabled": True})
+    cfg = load_mission(run_dir / "config.toml", {**settings, f"{ROOT}enabled": True})
     page = open_page_socket(cfg.dashboard)
     if page.socket is None:
         raise ConfigError(page.text)

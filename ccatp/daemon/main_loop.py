@@ -10,21 +10,20 @@ from typing import Any
 import zmq
 from msgspec.structs import replace
 
-from ccatp.beacons.config.models import RadioConfig
 from ccatp.conditions import (
     FRAME_LATE,
     FRAMES_OLD,
     LINK_LOST,
     NO_FRAME_FOR,
     OPERATOR,
-    TABLE,
     Condition,
     Owner,
+    find_condition,
     text_of,
 )
 from ccatp.core import MissionClock, Severity, Verdict
 from ccatp.daemon.alarms import ActiveCause, AlarmList, active_cause
-from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionRunner, TimedFrame
+from ccatp.daemon.mission_runner import STILL, DriveCommand, LoopLimits, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import WAIT_PERIOD_S, RobotLoop
 from ccatp.daemon.robot_session import FrameAge
@@ -42,6 +41,7 @@ from ccatp.links.frame_answers import DriveRule
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
 from ccatp.links.topics import ESTIMATE_FRAMES, DangerEvent, MissionStatus
+from ccatp.missions import kind_of
 from ccatp.safety.escalation import Since
 from ccatp.survey.events import HELD, WAITS_FOR, Abort, Fault, Interrupted, Pause, Resume, StopHere
 from ccatp.survey.state import HoldState
@@ -60,10 +60,6 @@ EFFECT_TIMEOUT_S = 5.0
 
 # A robot that stands for longer is reported, with reason and advice, and again after each minute.
 STANDS_REPORT_S, STANDS_REPEAT_S = 30.0, 60.0
-
-
-# For a mission among beacons, which cannot relocalize: its pause becomes a fault without a hold before.
-BEACON_PAUSE_LIMITS_S = inf, 30.0
 
 
 COMMANDS: dict[OperatorCommand, Pause | Resume | Abort | StopHere] = {
@@ -116,7 +112,8 @@ class MainLoop(RobotLoop):
         cfg = args.config
         danger, timeout_s = args.endpoints.of("danger"), cfg.mission.verdict_timeout_s
         self.peer = self._verdicts = VerdictSubscriber(context, danger, timeout_s, self.heartbeat.publish_if_due)
-        self.clock = MissionClock(10.0 * cfg.run.step_s if isinstance(cfg, RadioConfig) else cfg.health.clock_jump_s)
+        self._limits: LoopLimits = kind_of(cfg).limits.get()(cfg)
+        self.clock = MissionClock(self._limits.clock_jump_s)
         self.frame_period_s = 0.0
         self._is_new_session, self._drives = False, DriveRule()
         self._is_restarted = args.is_restarted
@@ -126,8 +123,6 @@ class MainLoop(RobotLoop):
         self._unanswered: int | None = None
         self._failure: Exception | None = None
         self._standstill, self._frame_age = StandstillReport(), FrameAge()
-        health = None if isinstance(cfg, RadioConfig) else cfg.health
-        self._pause_limits_s = (health.pause_limit_s, health.hold_limit_s) if health else BEACON_PAUSE_LIMITS_S
         self._paused, self._has_gap = Since(), False
         self.exit_status = ExitStatus.INTERRUPTED
         self.alarms = AlarmList(args.run_dir, self.log)
@@ -260,7 +255,7 @@ class MainLoop(RobotLoop):
         row = self._own_pause_of(state)
         waits = row is not None and row.escalates_to is not None and not state.is_held_by_hand
         lasts_s = self._paused.lasts(now_s, waits and not self.is_lockstep)
-        hold_s, fault_s = self._pause_limits_s
+        hold_s, fault_s = self._limits.pause_s, self._limits.hold_s
         self._has_gap = self._has_gap and lasts_s >= 0.0
         if lasts_s >= hold_s and not self._has_gap:
             self._has_gap = True
@@ -272,7 +267,7 @@ class MainLoop(RobotLoop):
 
     def _own_pause_of(self, state: HoldState) -> Condition | None:
         """The row of a hold whose cause only this loop finds, so that it measures its duration itself."""
-        row = TABLE.get(state.cause.condition) if state.mode is HELD else None
+        row = find_condition(state.cause.condition) if state.mode is HELD else None
         return row if row is not None and row.owner is Owner.MAIN else None
 
     def _why_it_stands(self) -> str:
@@ -291,7 +286,7 @@ class MainLoop(RobotLoop):
             why = self._runner.status().cause or "is it ready, the line of sight free?"
             return f"waiting for a measurement of the laser system; {why}"
         # A mission that has not begun has no cause of its own while it waits for a finding of danger to end.
-        row, why, alarms = TABLE.get(state.cause.condition), text_of(state.cause), self.alarms.alarms
+        row, why, alarms = find_condition(state.cause.condition), text_of(state.cause), self.alarms.alarms
         advice = row.advice if row is not None else ""
         if not why and alarms and not alarms[0].ended:
             why, advice = alarms[0].cause, alarms[0].advice
@@ -500,15 +495,10 @@ class MainLoop(RobotLoop):
 
 
 def open_runner(args: ProcessArgs) -> AbstractContextManager[Callable[[MainLoop], MissionRunner]]:
-    """THE table of missions: opens the database, yields a factory. Imports only the configured one, to save time."""
-    cfg = args.config
-    if isinstance(cfg, RadioConfig):
-        from ccatp.beacons.daemon.runner import open_beacons  # noqa: PLC0415
-
-        return open_beacons(cfg, args)
-    from ccatp.daemon.survey_runner import open_survey  # noqa: PLC0415
-
-    return open_survey(cfg, args)
+    """Open the database of the configured mission; yields a factory of its runner."""
+    open_mission: Callable[[Any, ProcessArgs], AbstractContextManager[Callable[[MainLoop], MissionRunner]]]
+    open_mission = kind_of(args.config).runner.get()
+    return open_mission(args.config, args)
 
 
 def main() -> int:

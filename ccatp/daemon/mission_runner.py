@@ -1,7 +1,7 @@
 """The interface between main loop and mission, and the frames and drives that they exchange.
 
 The main loop handles links, clock, order and end; the mission everything that depends on its kind. A new kind of
-mission is a subclass of ``MissionRunner`` and a row in ``main_loop.open_runner``.
+mission has a subclass of ``MissionRunner``, which its ``ccatp.missions.MissionKind`` names.
 """
 
 # ruff: noqa: B027 - empty methods are for missions without such a peer, file or command
@@ -9,7 +9,7 @@ mission is a subclass of ``MissionRunner`` and a row in ``main_loop.open_runner`
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 
@@ -18,11 +18,8 @@ from ccatp.errors import ExitStatus
 from ccatp.links.bus import Telemetry
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import DisplayState, MissionStatus
-from ccatp.survey.events import SurveyOutcome
-
-if TYPE_CHECKING:  # each main loop imports its own
-    from ccatp.beacons.mission import BeaconMission
-    from ccatp.survey.statechart import Mission
+from ccatp.survey.events import SurveyInput, SurveyOutcome
+from ccatp.survey.state import HoldState
 
 EXIT_STATUS = {
     SurveyOutcome.COMPLETE: ExitStatus.COMPLETE,
@@ -59,12 +56,37 @@ class DriveCommand(msgspec.Struct, frozen=True):
 STILL = DriveCommand(0.0, 0.0)
 
 
+class LoopLimits(NamedTuple):
+    """Limits of the main loop, s: steps of the robot's clock beyond the first are left out of the mission's time.
+
+    A pause that the main loop finds itself needs a fix after ``pause_s`` and is a fault after ``hold_s``.
+    """
+
+    clock_jump_s: float
+    pause_s: float
+    hold_s: float
+
+
+class RunningMission(Protocol):
+    """What the main loop needs of a mission."""
+
+    @property
+    def state(self) -> HoldState:
+        """The present state."""
+
+    @state.setter
+    def state(self, state: Any) -> None: ...
+
+    def handle(self, event: SurveyInput) -> str | None:
+        """Handle an event between two frames; the reason of a refusal, or ``None``."""
+
+
 class MissionRunner(ABC):
     """A mission in the main-loop process. ``on_drive``: called with number and set points of each drive sent."""
 
     def __init__(
         self,
-        mission: "Mission | BeaconMission",
+        mission: RunningMission,
         telemetry: Telemetry,
         on_drive: Callable[[int, float, float], None] = lambda *_: None,
     ) -> None:

@@ -12,7 +12,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +23,9 @@ import structlog
 import uvloop
 import zmq
 
-from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.files import keep_traceback, read_input
-from ccatp.config.load import is_radio_file, load_config, load_radio_config
-from ccatp.config.models import Config, ProcessesConfig
+from ccatp.config.load import load_mission
+from ccatp.config.mission import MissionConfig
 from ccatp.errors import CcatpError
 
 PR_SET_PDEATHSIG = 1
@@ -76,7 +75,7 @@ def run_dir_in(runtime_dir: Path) -> Path | None:
 class ProcessArgs:
     """Arguments of a process."""
 
-    config: Config | RadioConfig  # from the run directory
+    config: MissionConfig  # from the run directory
     run_dir: Path
     endpoints: Endpoints
     listen_fd: int | None  # an inherited listening socket
@@ -91,23 +90,6 @@ class ProcessArgs:
     def is_taking_over(self) -> bool:
         """Continues the work of another process."""
         return self.is_resuming or self.is_restarted
-
-
-def processes_of(cfg: Config | RadioConfig) -> ProcessesConfig:
-    """Time-outs, restarts and priorities of the processes."""
-    return cfg.processes if isinstance(cfg, RadioConfig) else cfg.run
-
-
-def read_config(
-    path: Path | None, settings: Mapping[str, object] | None = None, *, any_ports: bool = False
-) -> Config | RadioConfig:
-    """The configuration in a file, of a survey or of a mission among beacons; ``settings``: dotted keys that override.
-
-    ``any_ports``: simulated servers without a configured port take any free one.
-    """
-    is_radio = path is not None and is_radio_file(path)
-    load = load_radio_config if is_radio else load_config
-    return load(path, settings, any_ports=any_ports)
 
 
 def start_process(argv: list[str] | None = None) -> ProcessArgs:
@@ -136,7 +118,7 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
     for flag, name in FLAGS.items():
         parser.add_argument(flag, dest=name, action="store_true")
     args = parser.parse_args(argv)
-    return ProcessArgs(config=read_config(args.run_dir / "config.toml"), **vars(args))
+    return ProcessArgs(config=load_mission(args.run_dir / "config.toml"), **vars(args))
 
 
 def die_with_parent() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import zmq
 import zmq.asyncio
 
-from ccatp.daemon.process import ProcessArgs, open_log, processes_of, unless_stopped
+from ccatp.daemon.process import ProcessArgs, open_log, unless_stopped
 from ccatp.daemon.robot_session import LatenessStatistics, RobotSession
 from ccatp.links import realtime
 from ccatp.links.bus import PERIOD_S, HeartbeatPublisher, PeerSubscriber, Publisher
@@ -74,7 +74,7 @@ class RobotLoop(RobotSession):
         gc.freeze()  # otherwise a collection during the run visits all objects of the libraries, for about 50 ms
         joins = self.join(is_patient=self._args.is_taking_over)
         if await unless_stopped(stop, joins) and not self.is_lockstep:
-            realtime.enter(processes_of(self._args.config).realtime_priority, self.log)
+            realtime.enter(self._args.config.processes.realtime_priority, self.log)
 
     @abstractmethod
     def services(self) -> tuple[Coroutine[Any, Any, None], ...]:

@@ -12,13 +12,13 @@ from pathlib import Path, PurePath
 from typing import Any
 from uuid import uuid4
 
-from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.files import read_input, read_text, write_durably
-from ccatp.config.load import load_config
-from ccatp.config.models import Config
+from ccatp.config.mission import MissionConfig
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
+from ccatp.daemon.run_text import RunText
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import BESIDE, LOCK_FILE, TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
+from ccatp.missions import kind_of
 from ccatp.records.recorder import TELEMETRY, read_metadata
 
 FILE = Path("runs") / "unfinished"
@@ -143,13 +143,13 @@ def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Pa
     return parent / f"{now_utc:%Y%m%dT%H%M%SZ}-{PurePath(mirror).stem}-s{seed}"
 
 
-def recover(options: RunOptions, cfg: Config, run: Callable[[RunOptions, Config], int]) -> int:
+def recover(options: RunOptions, cfg: MissionConfig, run: Callable[[RunOptions, MissionConfig], int]) -> int:
     """Continue, held, the run that did not finish; otherwise begin a new one that can be recovered."""
     run_dir = find_resumable()
     if run_dir is not None:
         options = replace(options, run_dir=run_dir, resume=True, held=True)
     else:
-        run_dir = default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC)).absolute()
+        run_dir = default_run_dir(_folder_of(cfg), cfg.run.seed, datetime.now(UTC)).absolute()
         # An emergency of the last run stays latched: the robot waits at base until it is cleared.
         options = replace(options, run_dir=run_dir, held=take_over_emergencies(run_dir))
         mark_resumable(run_dir)
@@ -273,42 +273,27 @@ def keep_origin(run_dir: Path, *, is_sim: bool, is_new: bool) -> None:
     write_durably(run_dir / ORIGIN_FILE, json.dumps({"simulation": is_sim, "run_id": run_id}).encode())
 
 
-def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
+def _folder_of(cfg: MissionConfig) -> str:
+    text: RunText = kind_of(cfg).text.get()(cfg)
+    return text.folder or text.subject
+
+
+def make_run_dir(options: RunOptions, cfg: MissionConfig) -> Path:
     """The directory of a new run, or of a survey that is resumed with the same points.
 
     ConfigError: options or configuration contradict its content, or it cannot be created.
     """
-    is_survey = isinstance(cfg, Config)
-    name = cfg.run.mirror if isinstance(cfg, Config) else cfg.system
-    run_dir = options.run_dir or _make_new(default_run_dir(name, cfg.run.seed, datetime.now(UTC)))
+    kind = kind_of(cfg)
+    run_dir = options.run_dir or _make_new(default_run_dir(_folder_of(cfg), cfg.run.seed, datetime.now(UTC)))
     has_mission = (run_dir / "mission.sqlite").exists()
     if has_mission and not options.resume:
-        advice = "give --resume to continue it, or another folder" if is_survey else "name another folder"
+        advice = "give --resume to continue it, or another folder" if kind.no_resume is None else "name another folder"
         raise ConfigError(f"--run-dir: {run_dir} holds a mission already; {advice}")
     if options.resume and not has_mission:
         raise ConfigError(f"--resume: no mission in {run_dir}; name the folder of the run with --run-dir")
-    path = run_dir / "config.toml"
-    if options.resume and path.exists() and isinstance(cfg, Config):
-        before = load_config(path)
-        for key, was, wanted in (
-            ("run.mirror", before.mirror.name, cfg.mirror.name),
-            ("run.order", before.run.order, cfg.run.order),
-            ("run.panels", before.run.panels, cfg.run.panels),
-            ("run.seed", before.run.seed, cfg.run.seed),
-            ("run.world", before.world.name, cfg.world.name),
-        ):
-            if was != wanted:
-                raise ConfigError(
-                    f"--resume: {key} was {was} in {run_dir} and is {wanted} now; leave it out to keep what it was"
-                )
-        for section, then, now in (
-            ("mirror.surface", before.mirror.surface, cfg.mirror.surface),
-            ("mirror.panels", before.mirror.panels, cfg.mirror.panels),
-            ("world", before.world, cfg.world),
-        ):
-            if then != now:
-                text = f"section {section} is not that of {run_dir}; leave it out to keep what it was"
-                raise ConfigError(f"--resume: {text}")
+    if options.resume and (run_dir / "config.toml").exists() and kind.resumed is not None:
+        check: Callable[[Any, Path], None] = kind.resumed.get()
+        check(cfg, run_dir)
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -3,10 +3,10 @@
 import asyncio
 import socket
 import sys
+from typing import cast
 
 import numpy as np
 
-from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import Vector3
 from ccatp.daemon.child_processes import listen
@@ -44,11 +44,10 @@ def _run(
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.sim_etalon``."""
     args = start_process()
-    if isinstance(args.config, RadioConfig):
-        raise TypeError("a mission among beacons has no laser system")
+    cfg = cast(Config, args.config)  # only the process table of a survey has this process
     plan = read_plan(args.run_dir / FAULTS_FILE, lockstep=not args.is_realtime) if args.has_faults else FaultPlan()
     puck = ZmqPuck(args.endpoints.of("puck"))
-    return _run(args.config, puck, socket.socket(fileno=args.listen_fd), plan.faults)
+    return _run(cfg, puck, socket.socket(fileno=args.listen_fd), plan.faults)
 
 
 def run_alone(cfg: Config, puck_world_m: Vector3 | None, truth: str | None) -> int:

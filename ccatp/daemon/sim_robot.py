@@ -8,13 +8,13 @@ from pathlib import Path
 
 import structlog
 
-from ccatp.beacons.config.models import RadioConfig
-from ccatp.config.models import Config
+from ccatp.config.mission import MissionConfig
 from ccatp.daemon.child_processes import listen
-from ccatp.daemon.process import FAULTS_FILE, Endpoints, open_log, processes_of, run_until_stopped, start_process
+from ccatp.daemon.process import FAULTS_FILE, Endpoints, open_log, run_until_stopped, start_process
 from ccatp.dataloop import serve
 from ccatp.errors import ExitStatus
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
+from ccatp.missions import kind_of
 from ccatp.sim.fault_plan import FaultPlan, read_plan
 from ccatp.sim.ground_truth import FILE
 
@@ -44,17 +44,17 @@ def main() -> int:
 
 
 def run_alone(
-    cfg: Config | RadioConfig, lockstep: bool, faults: FaultPlan | None = None, runtime_dir: Path | None = None
+    cfg: MissionConfig, lockstep: bool, faults: FaultPlan | None = None, runtime_dir: Path | None = None
 ) -> int:
-    """Run only the simulated robot, of a survey or among beacons, for other controllers, until SIGINT or SIGTERM.
+    """Run only the simulated robot of any mission, for other controllers, until SIGINT or SIGTERM.
 
     It listens at the address in ``sim.robot``. The link does not report a fall: standard error has its time and place
     (``robot_fell``), and the status is that of a fault. The true state is available at ``puck`` in the runtime
     directory (by default the configured one), for ``ccatp sim etalon --truth``. ConfigError: it cannot listen there;
     RefusedError: another simulated robot uses that directory.
     """
-    folder = make_runtime_dir(str(runtime_dir or processes_of(cfg).runtime_dir), os.environ)
-    truth, what = Endpoints(folder).of("puck"), cfg.system if isinstance(cfg, RadioConfig) else cfg.mirror.name
+    folder = make_runtime_dir(str(runtime_dir or cfg.processes.runtime_dir), os.environ)
+    truth, what = Endpoints(folder).of("puck"), kind_of(cfg).text.get()(cfg).subject
     at, log = cfg.sim.robot, structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
     refusal = f"another simulated robot uses {folder}; end it, or give this one its own --runtime-dir"
     with locked(folder / TRUTH_LOCK_FILE, refusal), listen("sim.robot", at.host, at.port) as listener:

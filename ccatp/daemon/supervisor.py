@@ -1,6 +1,5 @@
-"""THE process table, and a run of these processes: start, supervision, summary."""
+"""THE process table of a survey, and a run of the processes of any mission: start, supervision, summary."""
 
-import importlib.util
 import json
 import os
 import resource
@@ -8,19 +7,17 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import zmq
 
-from ccatp.beacons.config.models import RadioConfig
 from ccatp.config.files import read_toml, write_durably
-from ccatp.config.load import dump_config, load_config
-from ccatp.config.models import Config
+from ccatp.config.load import dump_config, load_config, load_mission
+from ccatp.config.mission import MissionConfig
 from ccatp.daemon.alarms import AlarmList
 from ccatp.daemon.child_processes import (
     PageSocket,
@@ -29,21 +26,14 @@ from ccatp.daemon.child_processes import (
     ProcessSpec,
     listen,
     open_page_socket,
+    process_table,
     simulated_servers,
     token_query,
     with_addresses,
 )
 from ccatp.daemon.collector import Collector
 from ccatp.daemon.named_files import check_named_files
-from ccatp.daemon.process import (
-    ADDRESSES_FILE,
-    FAULTS_FILE,
-    RUN_DIR_FILE,
-    Endpoints,
-    open_log,
-    processes_of,
-    read_config,
-)
+from ccatp.daemon.process import ADDRESSES_FILE, FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
 from ccatp.daemon.run_dir import (
     RunOptions,
     await_predecessors,
@@ -55,12 +45,14 @@ from ccatp.daemon.run_dir import (
     take_runtime_dir,
     with_origin,
 )
+from ccatp.daemon.run_text import RunText
 from ccatp.daemon.terminal import STOP_SIGNALS, RunView, write_run_report
 from ccatp.daemon.webhook import AlarmWebhook
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.liveness import STALE_AFTER_S, Liveness
 from ccatp.links.service_manager import Notifier, is_journal, take_from
 from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat, MissionStatus
+from ccatp.missions import kind_of
 from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import TOKEN_FILE, make_token
 
@@ -93,13 +85,6 @@ PROCESSES: tuple[ProcessSpec, ...] = (
     ProcessSpec("etalon", "ccatp.daemon.sim_etalon", is_simulator=True, listens="sim.etalon"),
     ProcessSpec("danger", "ccatp.daemon.danger_loop", is_loop=True),
     ProcessSpec("main", "ccatp.daemon.main_loop", is_loop=True),
-)
-
-# Without a laser system, because positions come from radio. When main dies, its map is lost, and the run ends, held.
-BEACON_PROCESSES = tuple(
-    replace(spec, is_replaceable=spec.is_replaceable and spec.name != "main")
-    for spec in PROCESSES
-    if spec.name != "etalon"
 )
 
 
@@ -159,7 +144,7 @@ class SupervisedRun:
     def __init__(
         self,
         options: RunOptions,
-        cfg: Config | RadioConfig,
+        cfg: MissionConfig,
         run_dir: Path,
         endpoints: Endpoints,
         sockets: Mapping[str, socket.socket],
@@ -169,7 +154,7 @@ class SupervisedRun:
     ) -> None:
         self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
         self._sockets, self._locks, self._page, self._started_s = sockets, locks, page, started_s
-        self._children = ProcessManager(processes_of(cfg), self._command_of, self._notify_operator)
+        self._children = ProcessManager(cfg.processes, self._command_of, self._notify_operator)
         self._is_interrupted = self._has_begun = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
@@ -179,8 +164,9 @@ class SupervisedRun:
     def run(self) -> int:
         """Start, watch, collect, stop; returns the exit status."""
         cfg, is_sim, view = self._cfg, self._options.sim, self._view
-        what = {"system": cfg.system} if isinstance(cfg, RadioConfig) else {"mirror": cfg.mirror.name}
-        self._log.info("run_started", **what, seed=cfg.run.seed, sim=is_sim)
+        kind = kind_of(cfg)
+        text: RunText = kind.text.get()(cfg)
+        self._log.info("run_started", **{kind.subject: text.subject}, seed=cfg.run.seed, sim=is_sim)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag instead of an exception, so that no exception handler loses a signal, and no signal ends the shutdown.
         previous = {n: signal.signal(n, self._interrupt) for n in STOP_SIGNALS}
@@ -229,7 +215,7 @@ class SupervisedRun:
             has_token = self._page.socket is not None and not is_journal(STDERR, os.environ)
             token = token_query(self._cfg.dashboard, self._endpoints.runtime_dir) if has_token else ""
             self._view.show_message(self._page.level, self._page.text + token)
-        for process in BEACON_PROCESSES if isinstance(self._cfg, RadioConfig) else PROCESSES:
+        for process in process_table(self._cfg):
             # A process that listens runs only if it has a socket.
             if process.name in self._sockets or not process.listens:
                 self._children.start(process)
@@ -286,21 +272,16 @@ class SupervisedRun:
 
 
 def run(options: RunOptions) -> int:
-    """Run the configured survey or mission among beacons to its end; returns the exit status (``docs/operator.md``).
+    """Run the configured mission to its end; returns the exit status (``docs/operator.md``).
 
     CcatpError: the run could not begin.
     """
-    cfg = read_config(options.config_file, dict(options.overrides), any_ports=options.sim)
-    if isinstance(cfg, Config):
-        return recover(options, cfg, _run) if options.recover else _run(options, cfg)
-    if options.resume or options.recover:
+    cfg = load_mission(options.config_file, dict(options.overrides), any_ports=options.sim)
+    kind = kind_of(cfg)
+    if kind.no_resume is not None and (options.resume or options.recover):
         flag = "--resume" if options.resume else "--resume-last"
-        raise ConfigError(
-            f"{flag}: a mission among beacons cannot be resumed, because its map is not kept; start a new one"
-        )
-    if options.faults_file is not None:
-        raise ConfigError("--faults: plans are for surveys; sim.incidents of the configuration holds those of beacons")
-    return _run(options, cfg)
+        raise ConfigError(f"{flag}: a {kind.title} cannot be resumed, because {kind.no_resume}; start a new one")
+    return recover(options, cfg, _run) if options.recover else _run(options, cfg)
 
 
 def run_survey(options: RunOptions) -> int:
@@ -308,16 +289,16 @@ def run_survey(options: RunOptions) -> int:
     return _run(options, load_config(options.config_file, dict(options.overrides), any_ports=options.sim))
 
 
-def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
+def _run(options: RunOptions, cfg: MissionConfig) -> int:
     options = with_origin(options)
     permit_open_files()
-    if options.sim and isinstance(cfg, Config):
-        _check_physics(cfg.sim.robot.physics, has_faults=options.faults_file is not None)
+    check: Callable[[RunOptions, Any], None] = kind_of(cfg).check.get()
+    check(options, cfg)
     # The processes read these files again; checked here, an error is reported before anything has begun.
     check_named_files(cfg, is_sim=options.sim)
     started_s = time.monotonic()
     with ExitStack() as stack:
-        configured = str(options.runtime_dir or processes_of(cfg).runtime_dir)
+        configured = str(options.runtime_dir or cfg.processes.runtime_dir)
         runtime_dir = take_runtime_dir(stack, configured, is_sim=options.sim)
         make_token(runtime_dir)
         stack.callback((runtime_dir / TOKEN_FILE).unlink, missing_ok=True)
@@ -349,14 +330,6 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
         return SupervisedRun(options, cfg, run_dir, Endpoints(runtime_dir), sockets, locks, page, started_s).run()
 
 
-def _check_physics(physics: str, *, has_faults: bool) -> None:
-    """Raises ``ConfigError`` if the physics of the simulated robot is not available, before its process starts."""
-    if has_faults and physics != "lag":
-        raise ConfigError(f'--faults: plans are for sim.robot.physics = "lag", not for "{physics}"')
-    if physics == "mujoco" and importlib.util.find_spec("mujoco") is None:
-        raise ConfigError(f'sim.robot.physics = "{physics}": {physics} is not installed; pip install ccatp[physics]')
-
-
 def permit_open_files() -> None:
     """Raise the limit of open files, which the processes inherit; ConfigError: the system permits too few."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -366,7 +339,7 @@ def permit_open_files() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (OPEN_FILES, hard))
 
 
-def _addresses(cfg: Config | RadioConfig) -> dict[str, dict[str, object]]:
+def _addresses(cfg: MissionConfig) -> dict[str, dict[str, object]]:
     """Host and port of each peer and of the page."""
     sections = {"robot": cfg.robot, "etalon": getattr(cfg, "etalon", None)}
     sections["dashboard"] = cfg.dashboard if cfg.dashboard.enabled else None

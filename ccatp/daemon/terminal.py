@@ -14,13 +14,14 @@ import structlog
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from ccatp.beacons.config.models import RadioConfig
-from ccatp.conditions import TABLE, danger_text
-from ccatp.config.models import Config
+from ccatp.conditions import danger_text, find_condition
+from ccatp.config.mission import MissionConfig
 from ccatp.core import Severity
+from ccatp.daemon.run_text import RunText, clock
 from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
+from ccatp.missions import kind_of
 from ccatp.records.summary import format_table
 from ccatp.survey.events import DONE, HELD, IDLE, MAPPING, MEASURING, SETTLING, WAITS_FOR, MissionState
 
@@ -53,16 +54,16 @@ class RunView:
     ``verbosity``: -1 shows only warnings and errors; 1 adds each change of the state.
     """
 
-    def __init__(self, cfg: Config | RadioConfig, *, is_sim: bool, run_dir: Path, verbosity: int = 0) -> None:
+    def __init__(self, cfg: MissionConfig, *, is_sim: bool, run_dir: Path, verbosity: int = 0) -> None:
         self._is_quiet, self._is_verbose, self._state = verbosity < 0, verbosity > 0, ""
-        self._is_survey = isinstance(cfg, Config)
+        self._text: RunText = kind_of(cfg).text.get()(cfg)
         self._console: Console = _BufferedConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal and not self._is_quiet
         self._rate_limit = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
         self._has_pose = False
         self._verdict = (0, "", 0)  # code, cause and severity of the last event of danger
         self._shown_tenths = 0
-        title, self._goals = _title_and_goals(cfg, is_sim=is_sim)
+        title, self._goals = self._text.title(is_sim), self._text.goals
         if not self._is_quiet:
             self._console.print(printable(f"{title}; writing {run_dir}"), soft_wrap=True, markup=False)
         self._progress = Progress(
@@ -131,15 +132,8 @@ class RunView:
             self._console.print(f"{done}, {text}", soft_wrap=True)
 
     def text_of(self, status: MissionStatus) -> str:
-        """State, place, times, and the error on arrival or the uncertainty of the position."""
-        state, elapsed = status.state, f"{clock(status.elapsed_s)} elapsed"
-        if self._is_survey:
-            arrival = f", arrival {status.error_mm:.2f} mm" if status.error_mm else ""
-            rest = f"{clock(status.eta_s)} remaining{arrival}"
-        else:
-            state += f" ({status.cause})" if status.cause else ""
-            rest = f"position known to {0.1 * status.error_mm:.1f} cm"
-        return f"{state} {status.point}".strip() + f", {elapsed}, {rest}"
+        """State, place, times, and what else the kind of mission shows."""
+        return self._text.progress(status)
 
     def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
         """Print only JSON on standard output, or a table."""
@@ -154,17 +148,6 @@ class RunView:
         """Show where the report is, or why there is none; on standard error, to keep standard output pure JSON."""
         if not self._is_quiet:
             self._console.print(printable(f"report  {where}"), soft_wrap=True, markup=False)
-
-
-def _title_and_goals(cfg: Config | RadioConfig, *, is_sim: bool) -> tuple[str, str]:
-    """Headline of a run, and the name of the items that it counts."""
-    if isinstance(cfg, Config):
-        world = f", world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else ""
-        what = f"{'SIMULATION' if is_sim else 'survey'} of {cfg.mirror.name}{world}, filter {cfg.run.filter}"
-        return f"ccatp {what}", "points"
-    what, goals = ("follow a radio", "seconds") if cfg.follow.is_active else ("visit waypoints", "waypoints")
-    seed = f", seed {cfg.run.seed}" if is_sim else ""
-    return f"ccatp {'SIMULATION' if is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}", goals
 
 
 def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.FilteringBoundLogger) -> str:
@@ -204,13 +187,6 @@ BAR = 30
 _SHOWN = 10
 
 
-def clock(seconds: float) -> str:
-    """``1:02:03``, or ``2:03`` below an hour."""
-    minutes, rest = divmod(max(round(seconds), 0), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
-
-
 def _read(status: Mapping[str, Any]) -> MissionStatus:
     """The ``status`` in the reply of the operator channel."""
     return msgspec.convert({"seq": -1, "t_s": 0.0, "state": "", **status}, MissionStatus, strict=False)
@@ -229,7 +205,7 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
     bound = f"minimum {clock(status.lower_bound_s)}"
     # The error is exactly zero before the first arrival.
     arrival = f"{status.error_mm:.2f} mm from the last point, as estimated" if status.error_mm else "none yet"
-    row = TABLE.get(status.condition)
+    row = find_condition(status.condition)
     severity = Severity(max(status.severity, row.severity if row is not None else 0))
     late = f"{status.missed_deadlines}, worst {status.worst_lateness_ms:.0f} ms"
     grip = f"friction {status.friction:.2f}, thrust {status.grip:.2f} times the least that holds the robot"

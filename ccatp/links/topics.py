@@ -4,11 +4,13 @@ Liveness, recording and displays use the table; a new topic needs one row. Level
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import msgspec
 
 from ccatp.core import Verdict
+from ccatp.missions import MissionKind, all_kinds
 
 
 class Message(msgspec.Struct, kw_only=True):
@@ -16,6 +18,22 @@ class Message(msgspec.Struct, kw_only=True):
 
     seq: int
     t_s: float
+
+
+class TrackBatch(Message):
+    """Base of batches of estimates: a row for each frame, which begins with its number and time."""
+
+    rows: list[Any]
+
+
+class TruthBatch(Message):
+    """Base of batches of the simulated truth, likewise."""
+
+    rows: list[Any]
+
+
+class Reached(Message):
+    """Base of messages that a goal was reached; ``seq`` is the number that main recorded for the frame."""
 
 
 class Heartbeat(Message):
@@ -138,7 +156,7 @@ class Scene(Message):
     shapes: list[RobotShape]
 
 
-class TrackMessage(Message):
+class TrackMessage(TrackBatch):
     """A batch of estimates.
 
     Rows: seq, t_s, row and column of the panel, x_m, y_m, heading_rad (panel frame), sigma_m.
@@ -153,7 +171,7 @@ class SensorLines(Message):
     lines: list[msgspec.Raw]
 
 
-class ArrivalMessage(Message):
+class ArrivalMessage(Reached):
     """The robot came to rest at a measurement point for the first time; ``error_mm`` is the estimated distance."""
 
     point: tuple[int, int, int]
@@ -251,7 +269,7 @@ class Timing(Message):
     tick_us: list[float]
 
 
-class TruthMessage(Message):
+class TruthMessage(TruthBatch):
     """A batch of simulated truth (simulation only).
 
     Rows: seq, t_s, x_m, y_m, heading_rad (deck), X, Y, Z (surface point, deck, m), clearance of the worst edge sensor
@@ -267,60 +285,6 @@ class Misalignment(Message):
     """True misalignment of the simulated panels (simulation only): row, column, piston_m, tip_rad, tilt_rad."""
 
     panels: list[tuple[int, int, float, float, float]]
-
-
-class BeaconTrack(Message):
-    """A batch of estimates of a robot among beacons, in the frame of its start.
-
-    Rows: seq, t_s, x_m, y_m, heading_rad; covariance of these: xx, xy, yy, xh, yh, hh; dead reckoning: x_m, y_m.
-    """
-
-    rows: list[tuple[int, float, float, float, float, float, float, float, float, float, float, float, float]]
-
-
-BeaconEllipse = tuple[float, float, float, float, float]
-
-
-class BeaconMapMessage(Message):
-    """The map of a robot among beacons, for displays and reports; m. An ellipse is x, y, and covariance xx, xy, yy."""
-
-    system: str
-    pose: tuple[float, float, float]
-    pose_ellipse: BeaconEllipse
-    beacons: dict[str, BeaconEllipse]  # each radio or mote on the map
-    target: BeaconEllipse | None  # the radio that is followed; None before it was received
-    obstacles: list[tuple[float, float]]  # points of the room that the distance sensors measured recently
-    waypoints: list[tuple[float, float]]
-    next_waypoint: int  # the present target, -1 for none
-    distances: list[float]
-    nis_sum: float  # of all readings so far
-    nis_size: int  # their degrees of freedom
-    refused: int  # readings that the gate refused
-    notes: dict[str, float]  # of the mission about the map: phases, expected errors
-
-
-class BeaconArrival(Message):
-    """A waypoint was reached by the estimate: its number and the lap, both from 0, its position, the estimate."""
-
-    waypoint: int
-    lap: int
-    place: tuple[float, float]
-    estimate: BeaconEllipse
-
-
-class BeaconTruth(Message):
-    """A batch of simulated truth of a robot among beacons (simulation only).
-
-    Rows: seq, t_s, x_m, y_m, heading_rad; the moving radio: x_m, y_m; clearance of the body to the nearest obstacle, m.
-    """
-
-    rows: list[tuple[int, float, float, float, float, float | None, float | None, float | None]]
-
-
-class BeaconPlaces(Message):
-    """True positions of radios and motes (simulation only), m."""
-
-    places: dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,13 +320,33 @@ TOPICS: tuple[Topic, ...] = (
     Topic("timing", Timing, "main", 1.0, 0.0, False),
     Topic("misalignment", Misalignment, "dataloop", 0.0, 0.0, True),
     Topic("truth", TruthMessage, "dataloop", 1.0, 0.0, True),
-    Topic("beacon_track", BeaconTrack, "main", 1.0, 0.0, True),
-    Topic("beacon_map", BeaconMapMessage, "main", 2.0, 2.0, True),
-    Topic("beacon_arrival", BeaconArrival, "main", 0.0, 0.0, True),
-    Topic("beacon_places", BeaconPlaces, "dataloop", 0.0, 0.0, True),
-    Topic("beacon_truth", BeaconTruth, "dataloop", 1.0, 0.0, True),
 )
 BY_NAME = {topic.name: topic for topic in TOPICS}
+
+
+@cache
+def topics_of(kind: MissionKind) -> tuple[Topic, ...]:
+    """The topics of a run of one kind of mission: those of every run, and its own."""
+    return TOPICS if kind.topics is None else (*TOPICS, *kind.topics.get())
+
+
+@cache
+def _add_topics_of_kinds() -> None:
+    BY_NAME.update((topic.name, topic) for kind in all_kinds() for topic in topics_of(kind))
+
+
+def all_topics() -> tuple[Topic, ...]:
+    """The topics of every kind of mission."""
+    return tuple(dict.fromkeys(topic for kind in all_kinds() for topic in topics_of(kind)))
+
+
+def find_topic(name: str) -> Topic | None:
+    """The row of a topic; ``None``: no kind of mission has it."""
+    if name not in BY_NAME:
+        _add_topics_of_kinds()
+    return BY_NAME.get(name)
+
+
 # Danger advances the pose by the wheels itself, so a pose in every fifth frame is enough.
 ESTIMATE_FRAMES = 5
 
@@ -379,4 +363,7 @@ def last_estimate_before(seq: int) -> int:
 
 def schema_of(name: str) -> dict[str, Any]:
     """JSON schema of a topic's messages."""
-    return msgspec.json.schema(BY_NAME[name].message)
+    topic = find_topic(name)
+    if topic is None:
+        raise KeyError(name)
+    return msgspec.json.schema(topic.message)

@@ -12,6 +12,7 @@ microseconds wraps every 71.6 minutes. Readers join, sort and subtract by the nu
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -80,10 +81,21 @@ class _Stamp(msgspec.Struct):
 
 
 _decode_stamp = msgspec.json.Decoder(_Stamp).decode
-_BATCHES = frozenset(("track", "beacon_track"))
-_TRUTHS = frozenset(("truth", "beacon_truth"))
-TABLES = _BATCHES | _TRUTHS
-"""Topics with a row for each frame, which begins with its number and time."""
+
+
+@cache
+def _is_batch(topic: str) -> bool:
+    """Whether a topic has estimates, a row for each frame."""
+    row = topics.find_topic(topic)
+    return row is not None and issubclass(row.message, topics.TrackBatch)
+
+
+@cache
+def _is_read(topic: str) -> bool:
+    """Whether the first pass reads a topic."""
+    row = topics.find_topic(topic)
+    read = topics.SensorLines, topics.SessionMessage, topics.TrackBatch, topics.TruthBatch
+    return row is not None and issubclass(row.message, read)
 
 
 @dataclass(slots=True)
@@ -112,7 +124,7 @@ class _Found:
             self.t_s += [stamp.t for stamp in stamps]
             if utc_ns is not None and stamps:
                 self.utc.append((len(self.seq), utc_ns))
-        elif isinstance(message, topics.TrackMessage | topics.BeaconTrack) and message.rows:
+        elif isinstance(message, topics.TrackBatch) and message.rows:
             self.batches.append((place, message.seq, message.rows[-1][0]))
         elif isinstance(message, topics.SessionMessage):
             self.sessions.append((place, message))
@@ -122,7 +134,7 @@ class _Found:
     def use_tracks(self, path: Path) -> None:
         """Take the frames from the estimates, where no line of the robot is left."""
         for place, topic, _, payload in iter_places(path):
-            if topic in _BATCHES:
+            if _is_batch(topic):
                 try:
                     message: Any = decode_recorded(topic, payload)
                 except BadMessage:
@@ -131,9 +143,6 @@ class _Found:
                 self.seq += [row[0] for row in message.rows]
                 self.t_s += [row[1] for row in message.rows]
         self.batches, self.sessions = [], []
-
-
-_READ = frozenset(("sensors", "session")) | TABLES
 
 
 class Timeline:
@@ -290,8 +299,8 @@ class Timeline:
         """
         if not isinstance(message, topics.Message):
             return message
-        if isinstance(message, topics.TrackMessage | topics.BeaconTrack | topics.TruthMessage | topics.BeaconTruth):
-            is_truth = isinstance(message, topics.TruthMessage | topics.BeaconTruth)
+        if isinstance(message, topics.TrackBatch | topics.TruthBatch):
+            is_truth = isinstance(message, topics.TruthBatch)
             if not message.rows:
                 return message
             numbers = self.row_numbers(place, [row[0] for row in message.rows], is_truth=is_truth)
@@ -303,7 +312,7 @@ class Timeline:
             ]
             newest = rows[-1][:2] if rows else (message.seq, message.t_s)
             return msgspec.structs.replace(message, rows=rows, seq=newest[0], t_s=newest[1])
-        if isinstance(message, topics.ArrivalMessage | topics.BeaconArrival):  # with the number that main recorded
+        if isinstance(message, topics.Reached):  # with the number that main recorded
             number = int(self.row_numbers(place, [message.seq])[0])
         else:
             number = self.number_at(place, message.seq, is_main=not isinstance(message, topics.DangerEvent))
@@ -489,7 +498,7 @@ def read_timeline(path: Path, *, is_simulation: bool) -> Timeline:
     """The axis of a recording; ``OSError``: it cannot be read. Messages that cannot be read are left out."""
     found, damages = _Found(), list[str]()
     for place, (utc_offset_ns, (topic, t_s, payload)) in enumerate(iter_logged(path, damages.append)):
-        if topic in _READ:
+        if _is_read(topic):
             utc_ns = None if utc_offset_ns is None else utc_offset_ns + round(t_s * _NS)
             try:
                 found.take(place, topic, payload, utc_ns)

@@ -29,6 +29,7 @@ from ccatp.links import topics
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage, Message, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror
+from ccatp.missions import MissionKind
 from ccatp.records.recorder import RecordedMessage, RobotClock
 
 LOOP = 1  # of LinePrimitive.type
@@ -235,9 +236,9 @@ _encode = msgspec.json.Encoder().encode
 _sensors = msgspec.json.Decoder(Sensors)
 
 
-def recorded_schemas() -> list[tuple[str, dict[str, Any]]]:
+def recorded_schemas(kind: MissionKind) -> list[tuple[str, dict[str, Any]]]:
     """Name and schema of every channel of a recording: the recorded topics, and the views of them."""
-    recorded = [topic for topic in topics.TOPICS if topic.recorded]
+    recorded = [topic for topic in topics.topics_of(kind) if topic.recorded]
     raw = [(one.name, plain_schema(topics.schema_of(one.name), f"ccatp.{one.message.__name__}")) for one in recorded]
     return [*raw, *view_schemas()]
 

@@ -9,7 +9,7 @@ from itertools import chain, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ccatp.records.state_log import LogLine
@@ -54,17 +54,32 @@ def inline(figure: "Figure") -> Markup:
     return Markup(svg_of(figure))  # noqa: S704 - matplotlib and ElementTree escape every text in it
 
 
+class RunReport(NamedTuple):
+    """The report of a run: page, output of ``ccatp report --json``, figures by file name, warnings.
+
+    ``write_tables``: writes its tables into a directory; ``None``: this kind of mission has none.
+    """
+
+    markup: str
+    data: dict[str, Any]
+    drawings: dict[str, Draw]
+    warnings: tuple[str, ...]
+    write_tables: Callable[[Path], None] | None = None
+
+
 def render(template: str, **values: Any) -> str:
-    """The page as one HTML file without external resources."""
-    return environment().get_template(template).render(values)
+    """The page as one HTML file without external resources; a template of another package: ``package:name``."""
+    package, _, name = template.rpartition(":")
+    return environment(package).get_template(name).render(values)
 
 
 @cache
-def environment() -> Environment:
-    """The templates of this package, every text escaped, with the filters of this module."""
+def environment(package: str = "") -> Environment:
+    """The templates of a package and of this one, every text escaped, with the filters of this module."""
+    packages = dict.fromkeys((package or "ccatp.report", "ccatp.report"))
     found = Environment(
-        loader=PackageLoader("ccatp.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
+        loader=ChoiceLoader([PackageLoader(name) for name in packages]), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     found.filters.update(num=number_text, um=micro_text, clock=clock_text)
     found.globals.update(dash=DASH, policy=POLICY, script=Markup(SCRIPT), most=_MOST_ROWS)  # noqa: S704 - a file of ours

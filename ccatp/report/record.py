@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccatp.config.files import read_text
-from ccatp.config.load import is_radio_file, load_config
+from ccatp.config.load import kind_in, load_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, Measured, PanelId, Vector3
 from ccatp.links.bus import BadMessage
 from ccatp.links.topics import ArrivalMessage, FixMessage, MissionStatus
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.surface import MirrorError
+from ccatp.missions import SURVEY, MissionKind
 from ccatp.records.recorder import TELEMETRY, damage_text, decode_recorded, read_metadata, recordings
 from ccatp.records.run_reader import CONFIG, STORE, RunReadError, Trace, check_run_dir, read_truth, trace_of_truth
 from ccatp.records.state_log import LogLine, StateChange, changes_of, read_log
@@ -113,8 +114,9 @@ def read_record(run_dir: Path) -> RunRecord:
 
     Raises RunReadError: no such directory, no run in it, or no survey; ConfigError: its configuration cannot be used.
     """
-    if is_beacon_run(run_dir):
-        raise RunReadError(f"{run_dir}: a mission among beacons; this is for surveys, ccatp report takes both")
+    kind = kind_of_run(run_dir)
+    if SURVEY not in kind.systems:
+        raise RunReadError(f"{run_dir}: a {kind.title}; this is for surveys, ccatp report takes both")
     cfg = load_config(run_dir / CONFIG)
     mirror = build_mirror(cfg.mirror)
     folder = RunFolder(run_dir, "log of the processes, and when the mission changed its state")
@@ -147,10 +149,10 @@ def read_record(run_dir: Path) -> RunRecord:
     )
 
 
-def is_beacon_run(run_dir: Path) -> bool:
-    """Whether a run is a mission among beacons. Raises RunReadError, ConfigError: no run, or it cannot be read."""
+def kind_of_run(run_dir: Path) -> MissionKind:
+    """The kind of mission of a run. Raises RunReadError, ConfigError: no run, or it cannot be read."""
     check_run_dir(run_dir)
-    return is_radio_file(run_dir / CONFIG)
+    return kind_in(run_dir / CONFIG)
 
 
 def changed_keys(

@@ -28,16 +28,16 @@ from ccatp.core import DeckPose
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, RobotData, Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.onboard.rules import LinkedRobot
 from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan
 from ccatp.sim.ground_truth import SurveyTruth
 from ccatp.sim.plant import WHOLE
 from ccatp.sim.sensors import SensorSuite, as_message
+from ccatp.sim.simulated_robot import SimulatedRobot
 from ccatp.sim.world import World
 
 
-class Robot(LinkedRobot, SurveyTruth):
+class Robot(SimulatedRobot, SurveyTruth):
     """The survey robot; without ``start`` it starts at base, with a drawn error.
 
     ``rng`` is the parent of all generators. ``delivered_rows``: ``delivered`` with plain tuples for samples, before the

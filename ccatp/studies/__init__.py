@@ -9,6 +9,8 @@ from dataclasses import replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from ccatp.missions import built_in
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
@@ -20,7 +22,7 @@ Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
 """A study without runs: gets a configuration and a directory for files, returns the content of ``result.json``."""
 
 # Name: module and the name in it of a Study or an Analysis; title.
-STUDIES = {
+_OF_SURVEYS = {
     "thesis": ("ccatp.studies.thesis_study:STUDY", "the thesis's own simulation again, under several readings"),
     "filters": ("ccatp.studies.survey_studies:FILTERS", "filters in four worlds, over whole missions"),
     "time": ("ccatp.studies.survey_studies:TIME", "order, speed and measuring time against the hour"),
@@ -32,32 +34,9 @@ STUDIES = {
     "slides": ("ccatp.studies.physics_study:SLIDES", "a rigid body whose friction falls: when that is found"),
     "danger": ("ccatp.studies.danger_study:STUDY", "false edges and overrun of two edge rules"),
     "faults": ("ccatp.studies.faults_study:STUDY", "whole missions with random faults: falls, completion"),
-    "cricket": (
-        "ccatp.beacons.studies.cricket_study:STUDY",
-        "self-mapping of motes: the published figures, better ways",
-    ),
-    "mote-sizes": ("ccatp.beacons.studies.cricket_study:run_sizes", "time of self-mapping against the number of motes"),
-    "mote-navigation": (
-        "ccatp.beacons.studies.mote_navigation:STUDY",
-        "a robot guided by motes that mapped themselves",
-    ),
-    "radio-signals": (
-        "ccatp.beacons.studies.radio_studies:RADIO_SIGNALS",
-        "levels and bearings of ZigBee radios, beside 2017",
-    ),
-    "radio-slam": (
-        "ccatp.beacons.studies.radio_studies:RADIO_SLAM",
-        "EKF-SLAM among ZigBee radios: rooms, slip, shadowing",
-    ),
-    "radio-cases": ("ccatp.beacons.studies.radio_studies:RADIO_CASES", "cases I to III of 2017 side by side with ours"),
-    "radio-follow": ("ccatp.beacons.studies.radio_studies:RADIO_FOLLOW", "a moving radio followed, beside 2018"),
-    "recordings": (
-        "ccatp.beacons.studies.recordings:RECORDINGS",
-        "estimators on recorded runs among beacons, from several starts",
-    ),
-    "damage": ("ccatp.beacons.studies.damage:STUDY", "the filter on damaged recordings: recovered, reported or wrong"),
     "loops": ("ccatp.studies.loops:run", "Bode plots, margins and root loci of the controllers"),
 }
+STUDIES = _OF_SURVEYS | {name: study for kind in built_in() for name, study in kind.studies.items()}
 
 
 def find_study(name: str) -> "Study | Analysis":

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 import ccatp
-from ccatp.beacons.config.models import RadioConfig, RecordingsConfig
-from ccatp.config.models import Config
 from ccatp.errors import ExitStatus, UsageError
+from ccatp.missions import Part
 
 Factor = str | int | float | bool
 Factors = Mapping[str, Factor]
 Arrays = Mapping[str, NDArray[Any]]
-AnyConfig = Config | RadioConfig | RecordingsConfig
+AnyConfig = Any  # of the study's loader; with a section ``run``, whose ``seed`` is that of a job
+_SURVEYS = Part("ccatp.config.load:load_config")
 # From dotted keys, which override the configuration file, to a configuration.
 Load = Callable[[Mapping[str, object]], AnyConfig]
 
@@ -104,7 +104,7 @@ class Study:
     defaults: Mapping[str, object] = field(default_factory=dict)
     mirrors: tuple[str, ...] = ("thesis-m1",)  # crossed with the cells; empty if the cells choose the mirror
     runs: int = 20  # seeds of each cell, by default
-    loader: str = "load_config"  # function of ``ccatp.config.load``
+    loader: Part = _SURVEYS
     # Published values of a cell: ``printed`` in its result.
     published: Callable[[Factors], Mapping[str, Any]] | None = None
     with_peers: Callable[[], Sequence[Cell]] | None = None  # its cells, with those of programs by other authors

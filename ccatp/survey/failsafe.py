@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from ccatp.conditions import BACK_OFFS, EARTHQUAKE, STUCK_AT_EDGE, TABLE, Action, Clear, Condition
+from ccatp.conditions import BACK_OFFS, EARTHQUAKE, STUCK_AT_EDGE, Action, Clear, Condition, find_condition
 from ccatp.core import Severity, Verdict
 from ccatp.safety.escalation import limit_s
 from ccatp.survey.behaviours import Retreat, ReturnHome
@@ -42,7 +42,7 @@ def is_denied(v: Verdict) -> bool:
 
 def row_of(v: Verdict) -> Condition | None:
     """The row of a verdict's cause; ``None`` without a cause, or for one that is not known here."""
-    return TABLE.get(v.cause.condition)
+    return find_condition(v.cause.condition)
 
 
 def action_of(v: Verdict) -> Action | None:

@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.sim.robot import build_beacon_robot
 from ccatp.commissioning.conformance.harness import CheckFailed, Facts, parse
 from ccatp.commissioning.probes import probe_robot
-from ccatp.config.load import load_config, load_onboard_config, load_radio_config
+from ccatp.config.load import load_config, load_onboard_config
 from ccatp.config.robot_limits import (
     BEACON_FRAME_HZ,
     FRAME_HZ,

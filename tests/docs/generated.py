@@ -12,13 +12,14 @@ from pathlib import Path
 import click
 
 import ccatp.onboard.devices.daq
+from ccatp.beacons.conditions import GROUP as BEACONS
 from ccatp.beacons.mission import RULES
 from ccatp.cli import cli
-from ccatp.conditions import SAMPLE_RATES, TABLE, Action, Condition, Group
+from ccatp.conditions import SAMPLE_RATES, Action, Condition, Group, all_conditions
 from ccatp.config.robot_limits import LIMITS
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervisor import PROCESSES
-from ccatp.links.topics import TOPICS
+from ccatp.links.topics import all_topics
 from ccatp.survey.failsafe import ROWS
 from tests.contract.test_conformance_broken import TABLES
 
@@ -45,7 +46,7 @@ ABOUT = {
         "at full duty. On other mirrors they are only reported."
     ),
     Group.SURVEY: "The robot is held until an operator decides: resume, abort, or stop.",
-    Group.BEACONS: "Missions of robots among radio beacons (`system` in the configuration).",
+    BEACONS: "Missions of robots among radio beacons (`system` in the configuration).",
     Group.STORAGE: "A fix counts once it is on the disk; the survey does not continue without it.",
     Group.OBSERVATORY: "Code 2, latched until it is cleared by its id (`ccatp clear ID`), across restarts.",
 }
@@ -71,8 +72,8 @@ def alarms() -> str:
     """Every condition: what happens, and what to do."""
     what = "| message | found by | reaction | permitted motion | ends | limit | meaning | what to do |"
     parts = []
-    for group in Group:
-        rows = [_alarm(row) for row in TABLE.values() if row.group is group]
+    for group in dict.fromkeys((*Group, *(row.group for row in all_conditions()))):
+        rows = [_alarm(row) for row in all_conditions() if row.group == group]
         parts += [f"## {group}\n", *([f"{ABOUT[group]}\n"] if group in ABOUT else []), table(what, rows), ""]
     return "\n".join(parts)
 
@@ -113,7 +114,7 @@ def severities() -> str:
 def topics() -> str:
     """The topic table."""
     rows = []
-    for topic in TOPICS:
+    for topic in all_topics():
         rate = f"{topic.rate_hz:g}" if topic.rate_hz else "event"
         stale = f"{topic.stale_after_s:g}" if topic.stale_after_s else "\u2013"
         summary = (topic.message.__doc__ or "").strip().splitlines()[0]

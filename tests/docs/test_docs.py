@@ -15,7 +15,7 @@ import pytest
 from _pytest.mark.structures import ParameterSet
 
 from ccatp.cli import cli, main
-from ccatp.conditions import TABLE, Owner
+from ccatp.conditions import Owner, all_conditions
 from ccatp.filters import FILTERS
 from tests.docs.generated import DOCS, MADE, MARKED, ROOT, pages, shown
 from tests.support.rows import OTHERS
@@ -39,6 +39,7 @@ def test_what_holds_the_robot_has_its_row_and_no_row_is_without_use() -> None:
     assert len(rows) == len(set(rows))
     folders = ("survey", "estimation", "daemon", "beacons", "control")
     paths = [path for name in folders for path in (ROOT / "ccatp" / name).glob("**/*.py")]
+    paths = [path for path in paths if path.name != "conditions.py"]  # rows
     source = "\n".join(path.read_text(encoding="utf-8") for path in paths)
     calls = r"\b(?:fault|hold|interrupt|abort|_request_hold|Fault|Interrupted|Abort)\((?:self, |s, )?"
     texts = set(re.findall(calls + r'f?"([^"\n]*)"', source))
@@ -57,7 +58,7 @@ PLACES = {  # where the owner of a condition finds it
 
 
 def test_each_condition_is_used_where_its_owner_is() -> None:
-    for row in TABLE.values():
+    for row in all_conditions():
         paths = [path for name in PLACES[row.owner] for path in (ROOT / "ccatp").glob(f"{name}/**/*.py")]
         paths += [ROOT / "ccatp" / name for name in PLACES[row.owner] if name.endswith(".py")]
         sources = (path.read_text(encoding="utf-8") for path in paths)

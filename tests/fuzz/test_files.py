@@ -19,7 +19,7 @@ from ccatp.config.files import read_toml
 from ccatp.config.load import dump_config, load_config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
-from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessage, schema_of
+from ccatp.links.topics import FixMessage, Rest, SensorLines, TrackMessage, all_topics, schema_of
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.run_reader import RunReadError, open_run
 from ccatp.records.store import MissionStore, StoredPoint, StoreError
@@ -147,7 +147,7 @@ def store_target(folder: Path) -> Target:
 def sound_recording(folder: Path) -> bytes:
     """A short recording of a run."""
     path = folder / "sound.mcap"
-    topics = [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded]
+    topics = [(topic.name, schema_of(topic.name)) for topic in all_topics() if topic.recorded]
     config = dump_config(load_config(None, {"run.panels": 1}))
     recorder = Recorder(path, topics, is_simulation=True, metadata={"format": "1", "config": config})
     fix = FixMessage(

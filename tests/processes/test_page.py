@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Page, expect, sync_playwright
 
-from ccatp.config.load import load_radio_config
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.config.package import configs_dir
 from ccatp.report.dashboard.view import MAX_LINES, MAX_SAMPLES
 from tests.processes.conftest import Start

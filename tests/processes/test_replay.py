@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.studies.mote_navigation import rehearse_beacons
 from ccatp.cli import main
-from ccatp.config.load import load_config, load_radio_config
+from ccatp.config.load import load_config
 from ccatp.config.package import configs_dir
 from ccatp.records.recorder import iter_messages
 from ccatp.records.run_reader import open_run

@@ -51,7 +51,7 @@ def test_two_panels(recorded_run: RecordedRun) -> None:
     assert load_config(recorded_run.run_dir / "config.toml").run.panels == 2
     recorded = {message.topic for message in iter_messages(recorded_run.run_dir / "telemetry.mcap")}
     # Nothing went wrong, so there is nothing that the localizer had to be treated for.
-    of_surveys = {t.name for t in TOPICS if t.recorded and not t.name.startswith("beacon_")}
+    of_surveys = {t.name for t in TOPICS if t.recorded}
     views = {topic for topic in recorded if topic.startswith("view/")}
     assert recorded - views - {"danger_event"} == of_surveys - {"danger_event", "treatment"}
     assert {"view/pose", "view/true_pose", "view/panels", "view/points", "view/log"} <= views

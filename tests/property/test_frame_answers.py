@@ -13,10 +13,10 @@ import ccatp
 from ccatp.beacons.links.messages import BeaconFrame
 from ccatp.beacons.safety.rules import BeaconSafetyRules
 from ccatp.core import NO_CAUSE, EventCode, Verdict
-from ccatp.daemon.danger_loop import build_safety_monitor
 from ccatp.danger import DangerMonitor
 from ccatp.links.frame_answers import AWAY_SLACK_S, DriveRule, FrameId, JudgedFrame, PermitRule, is_restart, permitted
 from ccatp.links.robot_messages import CommandEcho, Sensors
+from ccatp.missions import kind_of
 from tests.support.scenario import config_of, radio_config_of
 
 NOTHING, ALL = (False, False, False), (True, True, True)
@@ -107,7 +107,9 @@ def frame(seq: int) -> Sensors:
 
 @lru_cache
 def monitor_of(kind: str) -> DangerMonitor | BeaconSafetyRules:
-    return build_safety_monitor(config_of() if kind == "survey" else radio_config_of())[0]
+    cfg = config_of() if kind == "survey" else radio_config_of()
+    rules: DangerMonitor | BeaconSafetyRules = kind_of(cfg).rules.get()(cfg).rules
+    return rules
 
 
 @pytest.mark.fault("L16")

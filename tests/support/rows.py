@@ -1,6 +1,6 @@
 """The rows of the table of conditions, by whether the danger loop finds them."""
 
-from ccatp.conditions import TABLE, Owner
+from ccatp.conditions import Owner, all_conditions
 
-DANGER = tuple(row for row in TABLE.values() if row.owner is Owner.DANGER)
-OTHERS = tuple(row for row in TABLE.values() if row.owner is not Owner.DANGER)
+DANGER = tuple(row for row in all_conditions() if row.owner is Owner.DANGER)
+OTHERS = tuple(row for row in all_conditions() if row.owner is not Owner.DANGER)

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RadioConfig
-from ccatp.config.load import available, load_config, load_radio_config
+from ccatp.config.load import available, load_config
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, motor_robot, survey_robot
 from ccatp.links.robot_codec import decode_from_robot

@@ -10,13 +10,12 @@ import zmq
 from ccatp.core import Cause, EventCode, Verdict
 from ccatp.links.bus import BadMessage, Publisher, Subscriber, unpack
 from ccatp.links.topics import (
-    BY_NAME,
     ESTIMATE_FRAMES,
-    TOPICS,
     EstimateMessage,
     Heartbeat,
     LogMessage,
     SensorLines,
+    all_topics,
     is_estimate_due,
     last_estimate_before,
 )
@@ -161,8 +160,8 @@ def test_what_is_not_of_the_table_is_refused(frame: bytes, why: str) -> None:
 
 
 def test_names_are_unique_and_levels_have_an_age() -> None:
-    assert len(BY_NAME) == len(TOPICS)
-    for topic in TOPICS:
+    assert len({topic.name for topic in all_topics()}) == len(all_topics())
+    for topic in all_topics():
         is_level = topic.rate_hz > 1.0
         assert (topic.stale_after_s > 0.0) == is_level, topic.name
         assert topic.stale_after_s == 0.0 or topic.stale_after_s >= 2.0 / topic.rate_hz  # one may be late

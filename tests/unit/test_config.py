@@ -8,16 +8,19 @@ from typing import Any
 
 import pytest
 
+from ccatp.beacons.config.load import load_radio_config
+from ccatp.beacons.kind import BEACONS
 from ccatp.cli import main
 from ccatp.config.describe import comments, differences, json_schema, template
 from ccatp.config.files import write_file
-from ccatp.config.load import available, dump_config, is_radio_file, load_config, load_radio_config, with_values
+from ccatp.config.load import available, dump_config, kind_in, load_config, load_mission, with_values
 from ccatp.config.messages import find_line
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
 from ccatp.links.runtime_dir import locked
 from ccatp.records.recorder import RUN_LOCK
+from ccatp.survey.kind import SURVEY
 from tests.support.command import answered, printed, refused
 
 
@@ -189,8 +192,9 @@ def test_the_schema_allows_what_the_loader_allows(capsys: pytest.CaptureFixture[
 def test_each_system_has_a_file_and_loads_back_equal(tmp_path: Path, system: str) -> None:
     file = configs_dir() / f"{system}.toml"
     assert load_radio_config(file).system == system
-    assert is_radio_file(file)
-    assert not is_radio_file(configs_dir() / "ccatp.toml")
+    assert kind_in(file) is BEACONS
+    assert kind_in(configs_dir() / "ccatp.toml") is SURVEY
+    assert load_mission(file) == load_radio_config(file)
     cfg = load_radio_config(None, {"system": system, "run.seed": 7})
     assert load_radio_config(write(tmp_path / "config.toml", dump_config(cfg))) == cfg
     assert len(cfg.cricket.networks) == 6

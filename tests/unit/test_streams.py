@@ -20,7 +20,16 @@ from scipy.spatial.transform import Rotation
 
 from ccatp.core import PanelId, PanelPose, PointId
 from ccatp.daemon.streaming import RUN, serve, streamed_schemas
-from ccatp.links.topics import TOPICS, FixMessage, LogMessage, Message, SensorLines, TrackMessage, TruthMessage
+from ccatp.links.topics import (
+    FixMessage,
+    LogMessage,
+    Message,
+    SensorLines,
+    TrackMessage,
+    TruthMessage,
+    topics_of,
+)
+from ccatp.missions import MissionKind, built_in
 from ccatp.records.recorder import RecordedMessage, RobotClock
 from ccatp.report.foxglove import (
     POINTS_AGAIN_S,
@@ -55,9 +64,11 @@ def read_like_a_viewer(schema: dict[str, Any], where: str) -> None:
             read_like_a_viewer(field, f"{where}.{name}")
 
 
-def test_viewers_can_read_the_schema_of_every_recorded_topic_and_view() -> None:
-    schemas = recorded_schemas()
-    assert [name for name, _ in schemas] == [t.name for t in TOPICS if t.recorded] + [view.name for view in VIEWS]
+@pytest.mark.parametrize("kind", built_in(), ids=lambda kind: kind.title)
+def test_viewers_can_read_the_schema_of_every_recorded_topic_and_view(kind: MissionKind) -> None:
+    schemas = recorded_schemas(kind)
+    recorded = [topic.name for topic in topics_of(kind) if topic.recorded]
+    assert [name for name, _ in schemas] == recorded + [view.name for view in VIEWS]
     for name, schema in schemas:
         read_like_a_viewer(schema, name)
         assert schema["title"].startswith(("ccatp.", "foxglove."))

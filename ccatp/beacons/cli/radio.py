@@ -57,11 +57,11 @@ def slam(
     PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, a CSV of events, or a ROS bag
     (docs/radio_data.md).
     """
+    from ccatp.beacons.config.load import load_recordings_config
     from ccatp.beacons.datasets.reader import read_run
     from ccatp.beacons.slam.evaluation import judge, result_data, table_lines
     from ccatp.beacons.slam.track_review import review_lines, reviewed
     from ccatp.beacons.studies.recordings import COMPARED, compared, estimate
-    from ccatp.config.load import load_recordings_config
     from ccatp.studies.results import markdown_table
 
     assumed = load_recordings_config(config_file, settings)
@@ -141,8 +141,8 @@ def radio_map(
         raise click.UsageError("--tags and --truth go with --ranges; a simulation knows both")
     if ranges_file is not None and seeds > 1:
         raise click.UsageError("--seeds is for simulated ranges; --ranges has been measured once")
+    from ccatp.beacons.config.load import load_radio_config
     from ccatp.beacons.cricket.measured_map import report_lines
-    from ccatp.config.load import load_radio_config
 
     system = {"system": "cricket"} if config_file is None else {}
     cfg = load_radio_config(config_file, {**system, **settings}, simulates=ranges_file is None)

@@ -237,8 +237,8 @@ def fuzzy(
     json_output: bool,
 ) -> None:  # fmt: skip
     """Show the fuzzy speed controller: its table, its surface, its value at a point."""
+    from ccatp.beacons.config.load import load_radio_config
     from ccatp.beacons.steering import FuzzyGapError, Sugeno
-    from ccatp.config.load import load_radio_config
 
     for distance_m, error_rad in at:
         if not (isfinite(distance_m) and isfinite(error_rad) and distance_m >= 0.0):

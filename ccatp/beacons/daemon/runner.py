@@ -3,33 +3,26 @@
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from math import cos, sin
+from math import cos, inf, sin
 from typing import TYPE_CHECKING
 
+from ccatp.beacons.conditions import FRAMES_MISSED
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.links.messages import NOTHING, Ellipse, decode_beacon_frame
+from ccatp.beacons.links.topics import BeaconArrival, BeaconMapMessage, BeaconTrack
 from ccatp.beacons.mission import BeaconMission, check_beacon_robot, track_row, wheel_rates
 from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader
 from ccatp.beacons.records.store import BeaconStore
 from ccatp.beacons.steering import HALT
-from ccatp.conditions import FRAMES_MISSED, text_of
+from ccatp.conditions import text_of
 from ccatp.core import Verdict
-from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
+from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, LoopLimits, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Telemetry
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello
-from ccatp.links.topics import (
-    BeaconArrival,
-    BeaconMapMessage,
-    BeaconTrack,
-    DisplayState,
-    EstimateMessage,
-    MissionStatus,
-    RobotShape,
-    Scene,
-)
+from ccatp.links.topics import DisplayState, EstimateMessage, MissionStatus, RobotShape, Scene
 from ccatp.survey.events import DONE, HELD, IDLE, RETURNING, Fault, MissionState
 
 if TYPE_CHECKING:
@@ -37,6 +30,14 @@ if TYPE_CHECKING:
 
 ECHO_MEMORY = 200  # number of recent echoes of the distance sensors, for displays
 TRAIL = 400  # number of places of the robot, one in five frames
+CLOCK_JUMP_FRAMES = 10.0
+# The robot cannot relocalize: a pause becomes a fault without a hold before.
+PAUSE_S, HOLD_S = inf, 30.0
+
+
+def loop_limits(cfg: RadioConfig) -> LoopLimits:
+    """Limits of the main loop."""
+    return LoopLimits(CLOCK_JUMP_FRAMES * cfg.run.step_s, PAUSE_S, HOLD_S)
 
 
 class BeaconRunner(MissionRunner):

@@ -3,11 +3,13 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.links import topics as beacon_topics
 from ccatp.beacons.links.messages import (
     TRACK_COLUMNS,
     TRUTH_COLUMNS,
@@ -20,6 +22,8 @@ from ccatp.beacons.links.messages import (
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, nees, rms_m
 from ccatp.links import topics
+from ccatp.records.recorder import RobotClock
+from ccatp.records.run_record import RunRecord
 from ccatp.records.summary import distribution, rounded, wall_figures
 
 WITHIN_SIGMAS = 3.0
@@ -27,7 +31,7 @@ _DISTRIBUTION = ("rmse", "mean", "p50", "p99", "max")
 
 
 @dataclass(slots=True)
-class BeaconSummary:
+class BeaconSummary(RunRecord):
     """Collects a run; ``has_truth``: it is simulated."""
 
     cfg: RadioConfig
@@ -48,16 +52,16 @@ class BeaconSummary:
 
     def take(self, message: topics.Message) -> None:
         """Take one message of the run."""
-        if isinstance(message, topics.BeaconTrack):
+        if isinstance(message, beacon_topics.BeaconTrack):
             self.track += message.rows
-        elif isinstance(message, topics.BeaconTruth):
+        elif isinstance(message, beacon_topics.BeaconTruth):
             self.truth += message.rows
-        elif isinstance(message, topics.BeaconPlaces):
+        elif isinstance(message, beacon_topics.BeaconPlaces):
             self.places = message.places
-        elif isinstance(message, topics.BeaconMapMessage):
+        elif isinstance(message, beacon_topics.BeaconMapMessage):
             self.beacons, self.notes = message.beacons, message.notes
             self.score = message.nis_sum, message.nis_size, message.refused
-        elif isinstance(message, topics.BeaconArrival):
+        elif isinstance(message, beacon_topics.BeaconArrival):
             self.reached.append((message.seq, message.estimate))
         elif isinstance(message, topics.Timing):
             self.ticks_us += message.tick_us
@@ -175,3 +179,8 @@ def beacon_errors(
             off = np.subtract((x, y), places[name])
             found[name] = float(np.hypot(*off)), float(off @ np.linalg.pinv(np.array(((xx, xy), (xy, yy)))) @ off)
     return found
+
+
+def beacon_record(cfg: RadioConfig, _run_dir: Path, _clock: RobotClock, is_sim: bool) -> BeaconSummary:
+    """The record of a run."""
+    return BeaconSummary(cfg, is_sim)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.links.messages import (
     TRACK_COLUMNS,
@@ -20,11 +21,11 @@ from ccatp.beacons.links.messages import (
     truth_in,
     worst_sigma_m,
 )
+from ccatp.beacons.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage
 from ccatp.beacons.records.summary import beacon_errors, sigmas_off
-from ccatp.config.load import load_radio_config
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import nees
-from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, MissionStatus
+from ccatp.links.topics import MissionStatus
 from ccatp.records.run_reader import CONFIG
 from ccatp.report.record import RunFiles, RunFolder, changed_keys, joined
 

@@ -11,24 +11,23 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from ccatp.beacons.config.models import RadioConfig
-from ccatp.beacons.links.messages import BeaconFrame
-from ccatp.conditions import (
-    ENCODERS_STALE,
-    NO_FRAME,
+from ccatp.beacons.conditions import (
     NO_FRESH_ESTIMATE,
     OBSTACLE_AHEAD,
     OBSTACLE_BEHIND,
     POSITION_UNCERTAIN,
     RADIO_SILENT,
     TARGET_NEAR,
-    MonitorFinding,
 )
+from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.links.messages import BeaconFrame, decode_beacon_frame
+from ccatp.conditions import ENCODERS_STALE, NO_FRAME, MonitorFinding
 from ccatp.core import EventCode, Permits, Verdict, wrap_pi
+from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
-from ccatp.safety.emergency_latch import EmergencyRules
 from ccatp.safety.escalation import limit_s
+from ccatp.safety.rules import FrameRules, SafetyRules
 from ccatp.sensing.sample_times import LATEST_S, possible_samples
 
 
@@ -85,7 +84,7 @@ class ObstacleBuffer:
 _NORMAL, _NEAR, _ABORTED = EventCode
 
 
-class BeaconSafetyRules(EmergencyRules):
+class BeaconSafetyRules(SafetyRules):
     """Gives one verdict per frame. Call ``step`` for each frame, ``stale`` when no frame arrived in time."""
 
     code: EventCode = _NORMAL
@@ -251,3 +250,17 @@ class BeaconSafetyRules(EmergencyRules):
         decades = (reference_dbm - mean_dbm) / (10.0 * loss.exponent)
         sigma = self._danger.target_level_sigma_db * log(10.0) / (10.0 * loss.exponent) / sqrt(len(self._levels))
         return float(10.0**decades) * (1.0 - min(sigma, 1.0))
+
+
+def beacon_rules(cfg: RadioConfig) -> FrameRules:
+    """The rules of a configuration. Without the distances in a line, obstacles are not known: no motion."""
+    rules = BeaconSafetyRules(cfg)
+
+    def judge(sensors: Sensors, raw: bytes, estimate: EstimateMessage | None) -> Verdict:
+        try:
+            extras = decode_beacon_frame(raw)
+        except BadLine:
+            return rules.stale(sensors.seq, sensors.t)
+        return rules.step(sensors, extras, estimate)
+
+    return FrameRules(rules, judge)

@@ -15,14 +15,13 @@ from msgspec.structs import replace
 
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.links.messages import BeaconFrame, SteerSample, with_extras
+from ccatp.beacons.links.topics import BeaconPlaces, BeaconTruth
 from ccatp.beacons.sim.motes import MoteListener, TrueMotes, true_motes
 from ccatp.beacons.sim.radio import SimDriveCommand, WorldFrame
 from ccatp.beacons.sim.radio_world import RadioWorld
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, RobotData, VehicleData
-from ccatp.links.topics import BeaconPlaces, BeaconTruth
-from ccatp.onboard.rules import LinkedRobot
-from ccatp.sim.ground_truth import TruthSource
+from ccatp.sim.simulated_robot import SimulatedRobot
 
 _CORNER = (0.0, 0.0)  # reported place of the edge sensors, which it does not have
 # Streams of random numbers of a seed, different from those of the world.
@@ -31,7 +30,7 @@ _LAYOUT, _RECEIVER = 20, 21
 BeaconTruthRow = tuple[int, float, float, float, float, float | None, float | None, float | None]
 
 
-class BeaconRobot(LinkedRobot, TruthSource):
+class BeaconRobot(SimulatedRobot):
     """The simulated robot; fan commands have no effect on its motion."""
 
     truth_rows = 50

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m
 from ccatp.beacons.cricket.mote_map import map_motes
 from ccatp.beacons.cricket.range_network import MoteRange, RangeNetwork, build_network, components
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
 from ccatp.beacons.studies.mote_runs import look_ahead, percentiles, run_batch, run_filter, simulate_field
-from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion

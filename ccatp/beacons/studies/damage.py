@@ -23,6 +23,7 @@ from ccatp.beacons.studies.recordings import (
     shipped_window,
 )
 from ccatp.core import FloatArray
+from ccatp.missions import Part
 from ccatp.studies.campaign import Cell, Factors, Job, JobOutcome, Study
 
 WINDOW_S = 240.0
@@ -312,5 +313,5 @@ STUDY = Study(
     draw=lambda _cells, _out: None,
     mirrors=(),
     runs=len(CASES),
-    loader="load_recordings_config",
+    loader=Part("ccatp.beacons.config.load:load_recordings_config"),
 )

@@ -34,6 +34,7 @@ from ccatp.filters.metrics import nees, rms
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
+from ccatp.missions import Part
 from ccatp.report.plots import QUIET
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.results import LIMIT, chi_square_band, colour, plot
@@ -236,5 +237,5 @@ STUDY = Study(
     defaults={"system": "cricket"},
     mirrors=(),
     runs=50,
-    loader="load_radio_config",
+    loader=Part("ccatp.beacons.config.load:load_radio_config"),
 )

@@ -35,6 +35,7 @@ from ccatp.beacons.steering import HALT
 from ccatp.beacons.studies.radio_bound import RadioBound, TrueStep, radio_bound
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.metrics import best_motion, rms, rms_m, wrapped
+from ccatp.missions import Part
 from ccatp.report.plots import INK
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.results import LIMIT, Measure, Row, band, chi_square_band, colour, draw_ranges, grouped, plot
@@ -97,6 +98,7 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
     return RadioRun(np.array(steps), errors_m, squares, nis, places, joint_nees, bound)
 
 
+LOADER = Part("ccatp.beacons.config.load:load_radio_config")
 _NOWHERE = (np.nan, np.nan)
 
 
@@ -234,7 +236,13 @@ def _draw_errors(results: Sequence[CellResult], name: str, label: str, keys: Seq
 
 
 RadioStudy = partial(
-    Study, run_job=run_job, combine=combine, columns=COLUMNS, mirrors=(), runs=50, loader="load_radio_config"
+    Study,
+    run_job=run_job,
+    combine=combine,
+    columns=COLUMNS,
+    mirrors=(),
+    runs=50,
+    loader=LOADER,
 )
 
 # -- radio-signals ----------------------------------------------------------------------------------------------------

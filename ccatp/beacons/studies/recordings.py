@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.cricket.measured_map import map_measured
 from ccatp.beacons.datasets.checks import survey_doubts
@@ -28,10 +29,10 @@ from ccatp.beacons.slam.level_fix import LevelLocator, fingerprint_fits, grid_po
 from ccatp.beacons.slam.path_loss import fit_path_loss
 from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, ReferencePath
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, import_gtsam, run_gtsam
-from ccatp.config.load import load_radio_config
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.filters.base import FilterError
+from ccatp.missions import Part
 from ccatp.studies.campaign import CampaignError, Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.results import Measure, draw_ranges, rows_by
 
@@ -302,5 +303,5 @@ RECORDINGS = Study(
     draw=draw_recordings,
     mirrors=(),
     runs=6,
-    loader="load_recordings_config",
+    loader=Part("ccatp.beacons.config.load:load_recordings_config"),
 )

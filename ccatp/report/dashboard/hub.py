@@ -23,7 +23,17 @@ class Wants(NamedTuple):
 
 
 SURVEY = Wants(("arrival", "fix", "scene"), "track", "truth", ())
-BEACONS = Wants(("beacon_arrival", "beacon_map", "scene"), "beacon_track", "beacon_truth", ("beacon_places",))
+
+
+class Page(NamedTuple):
+    """The page of one run: its state, a second view for the recorded past, constant data, topics."""
+
+    view: RunStateView
+    past: RunStateView
+    ground: dict[str, Any]
+    wants: Wants
+
+
 _OF_MAIN = ("heartbeat.main", "mission")
 _OF_DANGER = ("heartbeat.danger", "danger_event")
 # From one subscriber at a time: a publisher that never pauses must not delay the pages.

@@ -15,7 +15,7 @@ from ccatp.core import EmergencyKind, Verdict
 from ccatp.links import topics
 from ccatp.links.liveness import Liveness
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import BY_NAME, BeaconTruth, Heartbeat, MissionStatus, TruthMessage
+from ccatp.links.topics import BY_NAME, Heartbeat, MissionStatus, TruthBatch
 from ccatp.report.dashboard.history import GAP_S, Growing, Lines, RunFiles, Trail, TruthCompare
 
 LOOPS = ("main", "danger")
@@ -190,12 +190,12 @@ class RunStateView:
             Verdict: self._take_verdict,
             topics.DangerEvent: self._take_verdict,
             topics.Scene: self._take_scene,
-            TruthMessage: self._take_truth,
-            BeaconTruth: self._take_truth,
         }
 
     def receive(self, message: topics.Message | Verdict, now_s: float) -> None:
         """Process a message of the bus; messages that the page does not show are ignored."""
+        if isinstance(message, TruthBatch):
+            self._take_truth(message, now_s)
         handler = self._handlers.get(type(message))
         if handler is not None:
             handler(message, now_s)
@@ -278,7 +278,7 @@ class RunStateView:
             self._sigma_second = int(t_s)
             self._series["error"].add(self._mission_s(t_s), None, round(3e3 * sigma_m, 3))
 
-    def _take_truth(self, truth: TruthMessage | BeaconTruth, _now_s: float) -> None:
+    def _take_truth(self, truth: TruthBatch, _now_s: float) -> None:
         for seq, t_s, x_m, y_m, *_ in truth.rows:
             if (mission_s := self._mission_s(t_s)) is not None:
                 self._truth.truth(seq, mission_s, x_m, y_m)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from ccatp.beacons.conditions import RADIO_SILENT
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.links.messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.beacons.mission import RULES, BeaconMission, WaypointArrival, check_beacon_robot, permitted, wheel_rates
@@ -21,7 +22,7 @@ from ccatp.beacons.sim.robot import BeaconRobot
 from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
-from ccatp.conditions import ENCODERS_STALE, RADIO_SILENT, text_of
+from ccatp.conditions import ENCODERS_STALE, text_of
 from ccatp.core import NO_CAUSE, Cause, EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_codec import BadLine, decode_from_robot

@@ -25,11 +25,13 @@ from ccatp.daemon.child_processes import (
     open_page_socket,
     page_url,
 )
-from ccatp.daemon.collector import Collector, SurveyRecord
+from ccatp.daemon.collector import Collector
 from ccatp.daemon.process import Endpoints, parse_args, unless_stopped
+from ccatp.daemon.survey_record import SurveyRecord
 from ccatp.errors import DaemonUnreachableError
 from ccatp.links.bus import HeartbeatPublisher, Publisher
 from ccatp.links.topics import Heartbeat, MissionStatus
+from ccatp.records.recorder import RobotClock
 from ccatp.records.store import MissionStore, StoredPoint
 
 # Ends with the status in its variable, or waits for its end.
@@ -212,7 +214,7 @@ def test_a_summary_counts_the_points_of_the_database_where_the_last_status_was_l
             )
             store.record_fix(point, fix, DeckPose(0.0, 0.0, 0.0)).result()
         store.record_skipped(plan[3].point, 9.0).result()
-    survey = SurveyRecord(config, tmp_path, is_sim=False)
+    survey = SurveyRecord(config, tmp_path, RobotClock(is_simulation=False), False)
     survey.take(MissionStatus(seq=1, t_s=1.0, state="driving", total=9, done=2, elapsed_s=5.0))
     points, time_s = (survey.build(1.0)[key] for key in ("points", "mission_time_s"))
     assert (points["total"], points["measured"], points["skipped"], time_s) == (9, 3, 1, 5.0)

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.load import dump_config, load_config, load_radio_config
+from ccatp.beacons.config.load import load_radio_config
+from ccatp.beacons.daemon.run import PROCESSES as BEACON_PROCESSES
+from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
 from ccatp.daemon.process import run_dir_in
@@ -34,7 +36,7 @@ from ccatp.daemon.run_dir import (
     take_runtime_dir,
     with_origin,
 )
-from ccatp.daemon.supervisor import BEACON_PROCESSES, PROCESSES, run
+from ccatp.daemon.supervisor import PROCESSES, run
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import (
     LOCK_FILE,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from ccatp.config.load import load_radio_config
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.daemon.process import open_log
 from ccatp.daemon.survey_runner import state_text
 from ccatp.daemon.terminal import RunView, write_run_report

@@ -9,21 +9,17 @@ import msgspec
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.links.topics import BeaconArrival, BeaconMapMessage, BeaconPlaces, BeaconTrack, BeaconTruth
 from ccatp.beacons.mission import MODES
 from ccatp.beacons.report.dashboard.view import BeaconView, beacon_ground
-from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, EventCode, Fix, Measured, PanelId, PanelPose, PointId, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.topics import (
     Alarm,
     ArrivalMessage,
-    BeaconArrival,
-    BeaconMapMessage,
-    BeaconPlaces,
-    BeaconTrack,
-    BeaconTruth,
     DangerEvent,
     FixMessage,
     RobotShape,

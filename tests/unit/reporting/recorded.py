@@ -7,9 +7,11 @@ from typing import Any
 
 import msgspec
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.links.topics import BeaconArrival, BeaconMapMessage, BeaconPlaces, BeaconTrack, BeaconTruth
 from ccatp.conditions import text_of
-from ccatp.config.load import dump_config, load_config, load_radio_config
+from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, Measured, PanelId, PointId
 from ccatp.daemon.mission_runner import TimedFrame
@@ -18,11 +20,6 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import (
     TOPICS,
     ArrivalMessage,
-    BeaconArrival,
-    BeaconMapMessage,
-    BeaconPlaces,
-    BeaconTrack,
-    BeaconTruth,
     FixMessage,
     Message,
     Misalignment,

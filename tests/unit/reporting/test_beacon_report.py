@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from ccatp.beacons.report.page import beacon_data, beacon_drawings, beacon_page
 from ccatp.beacons.report.record import (
     beacon_rows,
     pose_errors_m,
@@ -15,7 +16,6 @@ from ccatp.beacons.report.record import (
 from ccatp.cli import main
 from ccatp.records.run_reader import RunReadError
 from ccatp.report.plots import NARROW, PX_PER_IN, WIDE
-from ccatp.report.run_page import beacon_data, beacon_drawings, beacon_page
 from tests.support.command import answered, printed
 from tests.unit.reporting.conftest import Markup
 from tests.unit.reporting.recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from ccatp.conditions import TABLE, Action, Clear, Condition, Group, Motion
+from ccatp.beacons.conditions import GROUP as BEACONS
+from ccatp.conditions import TABLE, Action, Clear, Condition, Motion
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.alarms import active_cause
@@ -25,7 +26,7 @@ from tests.unit.test_danger import Story as EdgeStory
 FREE = Verdict.normal(0, 0.0)
 LIMITS = {"health.pause_limit_s": 3.0, "health.hold_limit_s": 7.0, "health.lifted_limit_s": 5.0}
 HEALTH = config_of("fyst-m2", **{name.replace(".", "__"): value for name, value in LIMITS.items()}).health
-FOUND = [row for row in DANGER if row.severity and row.group is not Group.BEACONS]  # by a monitor
+FOUND = [row for row in DANGER if row.severity and row.group != BEACONS]  # by a monitor
 
 
 def named(rows: Sequence[Condition]) -> pytest.MarkDecorator:

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from ccatp import conditions as rows
-from ccatp.conditions import ALONE, TABLE, Condition, Group, Motion, Owner, fault, text_of
+from ccatp.beacons.conditions import GROUP as BEACONS
+from ccatp.conditions import ALONE, TABLE, Condition, Group, Motion, Owner, all_conditions, fault, text_of
 from ccatp.core import EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
@@ -313,7 +314,7 @@ ELSEWHERE = {
         rows.GRIP_TOO_LITTLE,
         rows.ACCELEROMETER_DIFFERENCES,
     ),
-    "tests/unit/beacons/test_mission.py": tuple(row for row in DANGER if row.group is Group.BEACONS),
+    "tests/unit/beacons/test_mission.py": tuple(row for row in DANGER if row.group == BEACONS),
 }
 
 
@@ -334,9 +335,9 @@ def test_a_name_is_registered_once() -> None:
 
 def test_only_conditions_that_are_reported_alone_have_equal_precedence() -> None:
     """A tie between findings of one frame is declared in no other way than by ``ALONE``."""
-    numbers = [row.precedence for row in TABLE.values() if row.precedence != ALONE]
+    numbers = [row.precedence for row in all_conditions() if row.precedence != ALONE]
     assert len(numbers) == len(set(numbers))
-    assert {row.owner is Owner.DANGER for row in TABLE.values() if row.precedence == ALONE} == {False}
+    assert {row.owner is Owner.DANGER for row in all_conditions() if row.precedence == ALONE} == {False}
     assert all(row.precedence != ALONE for row in DANGER)
 
 
@@ -354,7 +355,7 @@ def test_what_the_gyroscope_shows_at_rest_is_no_turn_afterwards() -> None:
     assert {text_of(verdict.cause) for verdict in seen} == {""}
 
 
-@pytest.mark.parametrize("row", TABLE.values(), ids=TABLE)
+@pytest.mark.parametrize("row", all_conditions(), ids=lambda row: row.name)
 def test_a_condition_that_pauses_holds_or_is_a_fault_permits_no_motion(row: Condition) -> None:
     """Also if its severity was raised: the denials of a frame follow from the permitted motion of each row."""
     if {row.severity, row.raised_severity} & {Severity.PAUSE, Severity.HOLD, Severity.FAULT}:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from ccatp.cli import main
-from ccatp.config import load as loaders
 from ccatp.config.load import load_config
 from ccatp.core import Cause
 from ccatp.mirror.mirror import build_mirror
@@ -421,7 +420,7 @@ def test_a_study_writes_its_figures_and_all_that_its_table_shows(
 def test_cells_are_configurations_of_their_own(name: str) -> None:
     study = CAMPAIGNS[name]
     cells = cells_of(study)
-    load = getattr(loaders, study.loader)
+    load = study.loader.get()
     plan = jobs_of(study, cells, lambda keys: load(None, keys), {}, 1)
     configurations = [group[0].cfg.model_dump_json() for group in plan]
     if name not in {

@@ -7,10 +7,11 @@ from typing import Any
 
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.links.messages import worst_sigma_m
+from ccatp.beacons.links.topics import BeaconArrival, BeaconMapMessage, BeaconPlaces, BeaconTrack
 from ccatp.beacons.mission import MODES
 from ccatp.beacons.report.record import expected_rms_m, standing_beacons, true_rms_m
-from ccatp.links.topics import BeaconArrival, BeaconMapMessage, BeaconPlaces, BeaconTrack
 from ccatp.report.dashboard.history import TruthCompare
+from ccatp.report.dashboard.hub import Page, Wants
 from ccatp.report.dashboard.view import MEASURED, PLANNED, RunStateView
 
 CODES = ["normal operation", "near something", "operation aborted"]
@@ -159,3 +160,12 @@ class BeaconView(RunStateView):
             {"id": f"true {name}", "kind": "true", "x_m": x_m, "y_m": y_m} for name, (x_m, y_m) in self._places.items()
         ]
         return [*true, *shapes]
+
+
+WANTS = Wants(("beacon_arrival", "beacon_map", "scene"), "beacon_track", "beacon_truth", ("beacon_places",))
+
+
+def beacon_page(cfg: RadioConfig, run_dir: Path, is_sim: bool) -> Page:
+    """The page of a run."""
+    view = BeaconView(cfg, is_sim=is_sim, run_dir=run_dir)
+    return Page(view, BeaconView(cfg, is_sim=is_sim), beacon_ground(cfg, is_sim=is_sim), WANTS)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.studies.gtsam_peer import PeerError, PeerGaveUp, run_gtsam
 from ccatp.cli import main
-from ccatp.config.load import load_recordings_config
 from ccatp.filters.base import FilterDiverged
 from tests.support.command import answered, printed
 from tests.unit.beacons.datasets.sets import (

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import PhaseTwoConfig
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.mote_plan import MotePlan, network_plan
@@ -21,7 +22,6 @@ from ccatp.beacons.cricket.self_mapping import MoteMapper, complete_stands, cond
 from ccatp.beacons.cricket.trilateration import DegenerateStep, FirstMap, map_by_plan
 from ccatp.beacons.sim.motes import true_motes
 from ccatp.beacons.studies.mote_runs import first_map, simulate_field
-from ccatp.config.load import load_radio_config
 from tests.unit.beacons.cricket.fields import (
     ADJACENT,
     ALL,

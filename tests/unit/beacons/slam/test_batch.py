@@ -8,6 +8,7 @@ import pytest
 from scipy.linalg import LinAlgError
 from scipy.spatial.transform import Rotation
 
+from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import OdometryNoiseConfig, PriorsConfig, RadioNoiseConfig, RecordingConfig
 from ccatp.beacons.slam.batch_problem import BEACON, CALIBRATION, SHARED, BatchProblem, BatchState, Reckoning, repeats
 from ccatp.beacons.slam.batch_smoother import Factored, smooth, t_cost, t_weights
@@ -21,7 +22,6 @@ from ccatp.beacons.slam.recording import (
     Steps,
     dead_reckoned,
 )
-from ccatp.config.load import load_recordings_config
 from ccatp.filters.metrics import RigidMotion, aligned_rms_m, best_motion, consistency, nees
 from tests.unit.beacons.datasets.sets import BEACONS, changed, recorded, world
 

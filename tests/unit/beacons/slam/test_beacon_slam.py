@@ -8,6 +8,7 @@ from time import perf_counter
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import FixedLagConfig
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.trajectory import bridged
@@ -27,7 +28,6 @@ from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import BeaconId, EstimatedPath, Reading, RecordedRun, Steps
 from ccatp.beacons.slam.track_review import range_residuals
-from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.metrics import aligned_rms_m, best_motion
 from tests.support.slam_settings import Settings, odometry, settings, trust

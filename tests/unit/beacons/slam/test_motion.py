@@ -8,13 +8,13 @@ from time import perf_counter
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import ScanConfig
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun
 from ccatp.beacons.slam.signal_slam import ReflectorScan
-from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
 from tests.support.slam_settings import odometry, settings
 from tests.unit.beacons.datasets.sets import recorded, world

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.filters.ekf_slam import EkfSlam
 from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace, grid_points, likeliest_names
@@ -14,7 +15,6 @@ from ccatp.beacons.slam.path_loss import LevelPair, PathLoss, PathLossError, Pat
 from ccatp.beacons.slam.recording import Reading
 from ccatp.beacons.slam.signal_slam import MovingRadio, SignalSlam
 from ccatp.beacons.studies.radio_studies import run_radio
-from ccatp.config.load import load_radio_config
 
 ODOMETRY: dict[str, Odometry] = {
     "ackermann": Steering(0.1, 0.1, 0.15, 0.3),

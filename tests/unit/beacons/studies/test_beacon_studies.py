@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.load import load_radio_config, load_recordings_config
 from ccatp.beacons.cricket.mote_map import MoteMap, map_motes
 from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.studies import cricket_study, mote_runs
@@ -17,7 +18,6 @@ from ccatp.beacons.studies.mote_navigation import combine as mote_navigation_com
 from ccatp.beacons.studies.mote_runs import run_batch, run_filter, simulate_field, sure_rms_m
 from ccatp.beacons.studies.radio_bound import TrueStep, radio_bound
 from ccatp.beacons.studies.recordings import combine_recordings, estimate, events_of, run_recordings
-from ccatp.config.load import load_radio_config, load_recordings_config
 from ccatp.config.models import Config
 from ccatp.studies.campaign import CampaignError, Cell, CellResult, Job, JobOutcome
 from tests.unit.beacons.datasets.sets import recorded, world

@@ -1,0 +1,39 @@
+"""A run of a mission among beacons: its processes, its texts, what is checked before it begins."""
+
+from dataclasses import replace
+
+from ccatp.beacons.config.models import RadioConfig
+from ccatp.daemon.run_dir import RunOptions
+from ccatp.daemon.run_text import RunText, progress_text
+from ccatp.daemon.supervisor import PROCESSES as OF_SURVEY
+from ccatp.errors import ConfigError
+from ccatp.links.topics import MissionStatus
+
+# Without a laser system, because positions come from radio. When main dies, its map is lost, and the run ends, held.
+PROCESSES = tuple(
+    replace(spec, is_replaceable=spec.is_replaceable and spec.name != "main")
+    for spec in OF_SURVEY
+    if spec.name != "etalon"
+)
+
+
+def beacon_text(cfg: RadioConfig) -> RunText:
+    """The texts of a mission among beacons."""
+    what, goals = ("follow a radio", "seconds") if cfg.follow.is_active else ("visit waypoints", "waypoints")
+
+    def title(is_sim: bool) -> str:
+        seed = f", seed {cfg.run.seed}" if is_sim else ""
+        return f"ccatp {'SIMULATION' if is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}"
+
+    return RunText(subject=cfg.system, title=title, goals=goals, shown=f"system {cfg.system}", progress=_progress)
+
+
+def _progress(status: MissionStatus) -> str:
+    state = status.state + (f" ({status.cause})" if status.cause else "")
+    return progress_text(status, state, f"position known to {0.1 * status.error_mm:.1f} cm")
+
+
+def check_beacon_run(options: RunOptions, _cfg: RadioConfig) -> None:
+    """Raises ``ConfigError``: there is a fault plan."""
+    if options.faults_file is not None:
+        raise ConfigError("--faults: plans are for surveys; sim.incidents of the configuration holds those of beacons")

@@ -1,0 +1,44 @@
+"""Missions among beacons as a kind of mission: radio SLAM, a radio that is followed, ultrasonic motes."""
+
+from ccatp.missions import MissionKind, Part
+
+_STUDIES = "ccatp.beacons.studies"
+
+BEACONS = MissionKind(
+    systems=("zigbee", "follow", "cricket"),
+    title="mission among beacons",
+    no_resume="its map is not kept",
+    load=Part("ccatp.beacons.config.load:load_radio_config"),
+    shipped=Part("ccatp.beacons.config.load:shipped_radio_config"),
+    text=Part("ccatp.beacons.daemon.run:beacon_text"),
+    check=Part("ccatp.beacons.daemon.run:check_beacon_run"),
+    processes=Part("ccatp.beacons.daemon.run:PROCESSES"),
+    record=Part("ccatp.beacons.records.summary:beacon_record"),
+    runner=Part("ccatp.beacons.daemon.runner:open_beacons"),
+    limits=Part("ccatp.beacons.daemon.runner:loop_limits"),
+    rules=Part("ccatp.beacons.safety.rules:beacon_rules"),
+    stand_in=Part("ccatp.beacons.dataloop:beacon_stand_in"),
+    page=Part("ccatp.beacons.report.dashboard.view:beacon_page"),
+    report=Part("ccatp.beacons.report.page:beacon_report"),
+    conditions="ccatp.beacons.conditions",
+    topics=Part("ccatp.beacons.links.topics:TOPICS"),
+    commands=(Part("ccatp.beacons.cli.radio:radio"),),
+    studies={
+        "cricket": (f"{_STUDIES}.cricket_study:STUDY", "self-mapping of motes: the published figures, better ways"),
+        "mote-sizes": (f"{_STUDIES}.cricket_study:run_sizes", "time of self-mapping against the number of motes"),
+        "mote-navigation": (f"{_STUDIES}.mote_navigation:STUDY", "a robot guided by motes that mapped themselves"),
+        "radio-signals": (
+            f"{_STUDIES}.radio_studies:RADIO_SIGNALS",
+            "levels and bearings of ZigBee radios, beside 2017",
+        ),
+        "radio-slam": (f"{_STUDIES}.radio_studies:RADIO_SLAM", "EKF-SLAM among ZigBee radios: rooms, slip, shadowing"),
+        "radio-cases": (f"{_STUDIES}.radio_studies:RADIO_CASES", "cases I to III of 2017 side by side with ours"),
+        "radio-follow": (f"{_STUDIES}.radio_studies:RADIO_FOLLOW", "a moving radio followed, beside 2018"),
+        "recordings": (
+            f"{_STUDIES}.recordings:RECORDINGS",
+            "estimators on recorded runs among beacons, from several starts",
+        ),
+        "damage": (f"{_STUDIES}.damage:STUDY", "the filter on damaged recordings: recovered, reported or wrong"),
+    },
+    races=Part("ccatp.beacons.studies.bench_cases:races"),
+)

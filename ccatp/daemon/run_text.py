@@ -1,0 +1,36 @@
+"""What a kind of mission says of a run: names for records, texts for the terminal."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from ccatp.links.topics import MissionStatus
+
+
+@dataclass(frozen=True, slots=True)
+class RunText:
+    """The texts of a configuration.
+
+    ``subject``: the mirror, or the system; ``folder``: in the name of the run directory; ``details``: further metadata
+    of the recording. ``title``: headline of a run, given whether it is simulated. ``goals``: what it counts. ``shown``:
+    for ``ccatp config check``. ``progress``: one line of a status.
+    """
+
+    subject: str
+    title: Callable[[bool], str]
+    goals: str
+    shown: str
+    progress: Callable[[MissionStatus], str]
+    folder: str = ""
+    details: Mapping[str, str] = field(default_factory=dict)
+
+
+def clock(seconds: float) -> str:
+    """``1:02:03``, or ``2:03`` below an hour."""
+    minutes, rest = divmod(max(round(seconds), 0), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def progress_text(status: MissionStatus, state: str, rest: str) -> str:
+    """State, place, elapsed time and the rest."""
+    return f"{state} {status.point}".strip() + f", {clock(status.elapsed_s)} elapsed, {rest}"

@@ -1,0 +1,23 @@
+"""The survey of a mirror as a kind of mission."""
+
+from ccatp.missions import SURVEY as NAME
+from ccatp.missions import MissionKind, Part
+
+SURVEY = MissionKind(
+    systems=(NAME,),
+    title="survey of a mirror",
+    subject="mirror",
+    load=Part("ccatp.config.load:load_config"),
+    shipped=Part("ccatp.config.describe:shipped_config"),
+    text=Part("ccatp.daemon.survey_run:survey_text"),
+    check=Part("ccatp.daemon.survey_run:check_survey"),
+    resumed=Part("ccatp.daemon.survey_run:check_resumed"),
+    processes=Part("ccatp.daemon.supervisor:PROCESSES"),
+    record=Part("ccatp.daemon.survey_record:SurveyRecord"),
+    runner=Part("ccatp.daemon.survey_runner:open_survey"),
+    limits=Part("ccatp.daemon.survey_run:loop_limits"),
+    rules=Part("ccatp.danger:survey_rules"),
+    stand_in=Part("ccatp.dataloop:survey_stand_in"),
+    page=Part("ccatp.report.dashboard.survey_page:survey_page"),
+    report=Part("ccatp.report.run_page:survey_report"),
+)
