@@ -32,7 +32,7 @@ from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
 from ccatp.safety.monitor import HealthMonitor
-from ccatp.safety.rules import FrameRules, SafetyRules
+from ccatp.safety.rules import SafetyRules
 from ccatp.sensing.sample_times import possible_samples
 
 CORNERS = tuple(Corner)
@@ -88,6 +88,10 @@ class DangerMonitor(SafetyRules):
         return {name: dict(zip(CORNERS, numbers, strict=True)) for name, numbers in counted.items()}
 
     # -- frames ---------------------------------------------------------------------------------------------------
+
+    def judge(self, sensors: Sensors, _raw: bytes, estimate: EstimateMessage | None) -> Verdict:
+        """See ``SafetyRules``."""
+        return self.step(sensors, estimate)
 
     def step(self, sensors: Sensors, estimate: EstimateMessage | None) -> Verdict:
         """The verdict on a frame, with main's newest estimate. A frame that is not new is not judged: no motion."""
@@ -279,7 +283,6 @@ class DangerMonitor(SafetyRules):
         return Verdict(seq, t_s, row.code, cause, signal, value, limit, *permits, off=off)
 
 
-def survey_rules(cfg: Config) -> FrameRules:
+def survey_rules(cfg: Config) -> SafetyRules:
     """The rules of a configuration."""
-    monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
-    return FrameRules(monitor, lambda sensors, _raw, estimate: monitor.step(sensors, estimate))
+    return DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)

@@ -45,21 +45,21 @@ class MissionKind:
     no_resume: str | None = None
     # Configuration. ``C`` below is its class, which has what ``config.mission.MissionConfig`` lists.
     load: Part  # config.load.LoadConfig
-    shipped: Part  # Callable[[C], C]: the shipped configuration with which another is compared
+    shipped: Part | None = None  # Callable[[C], C]: what a configuration is compared with, if not that of its system
     # The run: texts, what is checked before it begins, processes, summary.
-    text: Part  # Callable[[C], daemon.run_text.RunText]
-    check: Part  # Callable[[daemon.run_dir.RunOptions, C], None], raises ConfigError
+    text: Part = Part("ccatp.daemon.run_text:plain_text")  # Callable[[C], daemon.run_text.RunText]
+    check: Part | None = None  # Callable[[daemon.run_dir.RunOptions, C], None], raises ConfigError
     resumed: Part | None = None  # Callable[[C, Path], None], raises ConfigError: the run in a folder is another one
-    processes: Part  # tuple[daemon.child_processes.ProcessSpec, ...]
-    record: Part  # Callable[[C, Path, RobotClock, bool], records.run_record.RunRecord]
+    processes: Part = Part("ccatp.daemon.supervisor:WITHOUT_LASER")  # tuple[daemon.child_processes.ProcessSpec, ...]
+    record: Part = Part("ccatp.records.run_record:status_record")  # Callable[[C, Path, RobotClock, bool], RunRecord]
     # Main loop, danger loop, simulated robot.
     runner: Part  # Callable[[C, ProcessArgs], AbstractContextManager[Callable[[MainLoop], MissionRunner]]]
-    limits: Part  # Callable[[C], daemon.mission_runner.LoopLimits]
-    rules: Part  # Callable[[C], safety.rules.FrameRules]
+    limits: Part = Part("ccatp.daemon.mission_runner:usual_limits")  # Callable[[C], daemon.mission_runner.LoopLimits]
+    rules: Part = Part("ccatp.safety.rules:emergency_rules")  # Callable[[C], safety.rules.SafetyRules]
     stand_in: Part  # Callable[[C, dataloop.StandInOptions], dataloop.StandIn]
     # Views: the web page of a run, the report on it.
-    page: Part  # Callable[[C, Path, bool], report.dashboard.hub.Page]
-    report: Part  # Callable[[Path], report.html.RunReport]
+    page: Part | None = None  # Callable[[C, Path, bool], report.dashboard.hub.Page]; None: it has no page
+    report: Part | None = None  # Callable[[Path], report.html.RunReport]; None: it has no report
     # What it adds to the tables of the package.
     conditions: str = ""
     waits: Mapping[str, str] = field(default_factory=dict)

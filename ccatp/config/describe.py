@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from ccatp.config.files import read_toml
-from ccatp.config.load import DEFAULT_FILE, available, load_config
+from ccatp.config.load import DEFAULT_FILE, available, load_config, load_mission
 from ccatp.config.mission import MissionConfig
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
@@ -91,8 +91,10 @@ def differences(cfg: MissionConfig, other: MissionConfig | None = None) -> list[
 
     Without ``other`` the shipped configuration that is nearest, as of the same mirror and world.
     """
-    shipped: Callable[[Any], MissionConfig] = kind_of(cfg).shipped.get()
-    other = other or shipped(cfg)
+    if other is None:
+        kind = kind_of(cfg)
+        shipped: Callable[[Any], MissionConfig] | None = None if kind.shipped is None else kind.shipped.get()
+        other = load_mission(None, {"system": cfg.system}) if shipped is None else shipped(cfg)
     before, after = dict(_leaves(other.model_dump(mode="json"))), dict(_leaves(cfg.model_dump(mode="json")))
     keys = dict.fromkeys((*before, *after))
     return [(key, before.get(key), after.get(key)) for key in keys if before.get(key) != after.get(key)]

@@ -31,7 +31,7 @@ from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import DangerEvent
 from ccatp.missions import kind_of
 from ccatp.safety.emergency_latch import Emergency, EmergencyLatch
-from ccatp.safety.rules import FrameRules
+from ccatp.safety.rules import SafetyRules
 
 FILE = "emergencies.json"
 # Enough for some hundred active emergencies and as many cleared ones.
@@ -121,8 +121,7 @@ class DangerLoop(RobotLoop):
     def __init__(self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         super().__init__("danger", "monitor", args, context)
         self._cfg = cfg = args.config
-        made: FrameRules = kind_of(cfg).rules.get()(cfg)
-        self.monitor, self._judge = made
+        self.monitor: SafetyRules = kind_of(cfg).rules.get()(cfg)
         self.monitor.latch = PersistentEmergencyLatch(args.run_dir / FILE, self.log)
         self.peer = self._estimates = EstimateSubscriber(
             context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
@@ -193,7 +192,7 @@ class DangerLoop(RobotLoop):
             return
         estimate = self._estimates.latest(sensors.seq, is_lockstep=is_lockstep)
         try:
-            verdict = self._judge(sensors, raw, estimate)
+            verdict = self.monitor.judge(sensors, raw, estimate)
         except Exception as error:
             # Without a verdict the robot's permit expires, and the robot holds by itself.
             self.log.exception("unhandled_exception", seq=self._seq)

@@ -56,7 +56,10 @@ async def serve_page(
     """
     settings, is_over = cfg.dashboard, asyncio.Event()
     tokens = page_tokens(settings, endpoints.runtime_dir)
-    make: Callable[[Any, Path, bool], Page] = kind_of(cfg).page.get()
+    kind = kind_of(cfg)
+    if kind.page is None:
+        raise ConfigError(f"a {kind.title} has no page; see ccatp status")
+    make: Callable[[Any, Path, bool], Page] = kind.page.get()
     view, past, ground, wants = make(cfg, run_dir, is_sim)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     reader = BusReader(context, endpoints.of, view, is_sim=is_sim, wants=wants)

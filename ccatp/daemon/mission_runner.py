@@ -9,6 +9,7 @@ mission has a subclass of ``MissionRunner``, which its ``ccatp.missions.MissionK
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from math import inf
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
@@ -65,6 +66,11 @@ class LoopLimits(NamedTuple):
     clock_jump_s: float
     pause_s: float
     hold_s: float
+
+
+def usual_limits(_cfg: object) -> LoopLimits:
+    """Limits for a robot that cannot relocalize: a pause becomes a fault without a fix before."""
+    return LoopLimits(clock_jump_s=0.1, pause_s=inf, hold_s=30.0)
 
 
 class RunningMission(Protocol):

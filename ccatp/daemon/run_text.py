@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from ccatp.config.mission import MissionConfig
 from ccatp.links.topics import MissionStatus
 
 
@@ -34,3 +35,15 @@ def clock(seconds: float) -> str:
 def progress_text(status: MissionStatus, state: str, rest: str) -> str:
     """State, place, elapsed time and the rest."""
     return f"{state} {status.point}".strip() + f", {clock(status.elapsed_s)} elapsed, {rest}"
+
+
+def plain_text(cfg: MissionConfig) -> RunText:
+    """The texts of a kind of mission that has none of its own."""
+
+    def title(is_sim: bool) -> str:
+        return f"ccatp {'SIMULATION' if is_sim else 'mission'} of {cfg.system}, seed {cfg.run.seed}"
+
+    def progress(status: MissionStatus) -> str:
+        return progress_text(status, status.state, f"{clock(status.eta_s)} remaining")
+
+    return RunText(subject=cfg.system, title=title, goals="goals", shown=f"system {cfg.system}", progress=progress)

@@ -86,6 +86,8 @@ PROCESSES: tuple[ProcessSpec, ...] = (
     ProcessSpec("danger", "ccatp.daemon.danger_loop", is_loop=True),
     ProcessSpec("main", "ccatp.daemon.main_loop", is_loop=True),
 )
+# Of a mission without a laser system.
+WITHOUT_LASER = tuple(spec for spec in PROCESSES if spec.name != "etalon")
 
 
 class Service:
@@ -292,8 +294,10 @@ def run_survey(options: RunOptions) -> int:
 def _run(options: RunOptions, cfg: MissionConfig) -> int:
     options = with_origin(options)
     permit_open_files()
-    check: Callable[[RunOptions, Any], None] = kind_of(cfg).check.get()
-    check(options, cfg)
+    kind = kind_of(cfg)
+    if kind.check is not None:
+        check: Callable[[RunOptions, Any], None] = kind.check.get()
+        check(options, cfg)
     # The processes read these files again; checked here, an error is reported before anything has begun.
     check_named_files(cfg, is_sim=options.sim)
     started_s = time.monotonic()
@@ -307,7 +311,8 @@ def _run(options: RunOptions, cfg: MissionConfig) -> int:
             for name, section, at in simulated_servers(cfg):
                 sockets[name] = stack.enter_context(listen(section, at.host, at.port))
             cfg = with_addresses(cfg, sockets)
-        page = open_page_socket(cfg.dashboard)
+        has_page = kind.page is not None
+        page = open_page_socket(cfg.dashboard if has_page else cfg.dashboard.model_copy(update={"enabled": False}))
         if page.socket is not None:
             sockets["dashboard"] = stack.enter_context(page.socket)
             cfg = cfg.model_copy(update={"dashboard": page.config})

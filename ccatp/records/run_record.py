@@ -2,10 +2,12 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
-from ccatp.links.topics import Message
-from ccatp.records.recorder import RecordedMessage
+from ccatp.config.mission import MissionConfig
+from ccatp.links.topics import Message, MissionStatus
+from ccatp.records.recorder import RecordedMessage, RobotClock
 
 
 class RunRecord(ABC):
@@ -30,3 +32,26 @@ class RunRecord(ABC):
     @abstractmethod
     def build(self, wall_s: float) -> dict[str, Any]:
         """The summary, after main has closed the mission's database; ``wall_s``: duration of the run."""
+
+
+class StatusRecord(RunRecord):
+    """A summary from the status of the mission alone."""
+
+    def __init__(self, system: str, seed: int) -> None:
+        self._run: dict[str, Any] = {"system": system, "seed": seed}
+
+    def take(self, message: Message) -> None:
+        """Take one message of the run."""
+        if isinstance(message, MissionStatus):
+            goals = {"total": message.total, "reached": message.done}
+            self._run |= {"outcome": message.outcome, "cause": message.cause, "goals": goals}
+            self._run["mission_time_s"] = message.elapsed_s
+
+    def build(self, wall_s: float) -> dict[str, Any]:
+        """The summary."""
+        return {**self._run, "wall": {"time_s": round(wall_s, 3)}}
+
+
+def status_record(cfg: MissionConfig, _run_dir: Path, _clock: RobotClock, _is_sim: bool) -> RunRecord:
+    """The record of a kind of mission that has none of its own."""
+    return StatusRecord(cfg.system, cfg.run.seed)

@@ -38,6 +38,8 @@ def report_run(
     for folder in filter(None, (figures_dir, tables_dir)):
         check_drawing(folder)
     kind = kind_of_run(run_dir)
+    if kind.report is None:
+        raise RunReadError(f"{run_dir}: a {kind.title} has no report; its result is in summary.json")
     make: Callable[[Path], RunReport] = kind.report.get()
     report = make(run_dir)
     if tables_dir is not None:

@@ -108,7 +108,7 @@ def frame(seq: int) -> Sensors:
 @lru_cache
 def monitor_of(kind: str) -> DangerMonitor | BeaconSafetyRules:
     cfg = config_of() if kind == "survey" else radio_config_of()
-    rules: DangerMonitor | BeaconSafetyRules = kind_of(cfg).rules.get()(cfg).rules
+    rules: DangerMonitor | BeaconSafetyRules = kind_of(cfg).rules.get()(cfg)
     return rules
 
 

@@ -57,8 +57,3 @@ def load_recordings_config(file: Path | None = None, overrides: Overrides = None
     """What is assumed of recorded radio data, by format, as in ``plaza.priors.range_scale``; errors as above."""
     command, user, base = sources = layers(RECORDING_FILE, file, overrides)
     return validated(RecordingsConfig, merged(merged(base.tree, user.tree), command.tree), sources)
-
-
-def shipped_radio_config(cfg: RadioConfig) -> RadioConfig:
-    """The shipped configuration of the same system."""
-    return load_radio_config(None, {"system": cfg.system})

@@ -5,16 +5,12 @@ from dataclasses import replace
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.daemon.run_dir import RunOptions
 from ccatp.daemon.run_text import RunText, progress_text
-from ccatp.daemon.supervisor import PROCESSES as OF_SURVEY
+from ccatp.daemon.supervisor import WITHOUT_LASER
 from ccatp.errors import ConfigError
 from ccatp.links.topics import MissionStatus
 
-# Without a laser system, because positions come from radio. When main dies, its map is lost, and the run ends, held.
-PROCESSES = tuple(
-    replace(spec, is_replaceable=spec.is_replaceable and spec.name != "main")
-    for spec in OF_SURVEY
-    if spec.name != "etalon"
-)
+# Positions come from radio. When main dies, its map is lost, and the run ends, held.
+PROCESSES = tuple(replace(spec, is_replaceable=spec.is_replaceable and spec.name != "main") for spec in WITHOUT_LASER)
 
 
 def beacon_text(cfg: RadioConfig) -> RunText:

@@ -27,7 +27,7 @@ from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.safety.escalation import limit_s
-from ccatp.safety.rules import FrameRules, SafetyRules
+from ccatp.safety.rules import SafetyRules
 from ccatp.sensing.sample_times import LATEST_S, possible_samples
 
 
@@ -115,6 +115,14 @@ class BeaconSafetyRules(SafetyRules):
         """No rule compares wheels with their set points."""
 
     # -- frames ---------------------------------------------------------------------------------------------------
+
+    def judge(self, sensors: Sensors, raw: bytes, estimate: EstimateMessage | None) -> Verdict:
+        """See ``SafetyRules``. Without the distances in a line, obstacles are not known: no motion."""
+        try:
+            extras = decode_beacon_frame(raw)
+        except BadLine:
+            return self.stale(sensors.seq, sensors.t)
+        return self.step(sensors, extras, estimate)
 
     def step(self, sensors: Sensors, extras: BeaconFrame, estimate: EstimateMessage | None) -> Verdict:
         """The verdict on one frame. A frame that is not new is not judged: no motion is permitted."""
@@ -250,17 +258,3 @@ class BeaconSafetyRules(SafetyRules):
         decades = (reference_dbm - mean_dbm) / (10.0 * loss.exponent)
         sigma = self._danger.target_level_sigma_db * log(10.0) / (10.0 * loss.exponent) / sqrt(len(self._levels))
         return float(10.0**decades) * (1.0 - min(sigma, 1.0))
-
-
-def beacon_rules(cfg: RadioConfig) -> FrameRules:
-    """The rules of a configuration. Without the distances in a line, obstacles are not known: no motion."""
-    rules = BeaconSafetyRules(cfg)
-
-    def judge(sensors: Sensors, raw: bytes, estimate: EstimateMessage | None) -> Verdict:
-        try:
-            extras = decode_beacon_frame(raw)
-        except BadLine:
-            return rules.stale(sensors.seq, sensors.t)
-        return rules.step(sensors, extras, estimate)
-
-    return FrameRules(rules, judge)
