@@ -36,7 +36,7 @@ class MissionKind:
     ``systems``: values of ``system`` in its configurations. ``title``: a mission of this kind, in messages.
     ``subject``: what its ``RunText.subject`` is, in log and recording. ``no_resume``: why no mission can be continued
     from its run directory; ``None``: it can. ``conditions``: module whose import registers the kind's own rows; empty:
-    none. ``waits``: what the robot waits for in modes that only this kind has.
+    none. ``waits``: what the robot waits for in modes that only this kind has; in those of ``stands`` it does not move.
     """
 
     systems: tuple[str, ...]
@@ -63,6 +63,7 @@ class MissionKind:
     # What it adds to the tables of the package.
     conditions: str = ""
     waits: Mapping[str, str] = field(default_factory=dict)
+    stands: tuple[str, ...] = ()
     topics: Part | None = None  # tuple[links.topics.Topic, ...]
     commands: tuple[Part, ...] = ()  # of click.Command, for the section of studies
     studies: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # as ``studies.STUDIES``

@@ -20,6 +20,12 @@ BEACONS = MissionKind(
     page=Part("ccatp.beacons.report.dashboard.view:beacon_page"),
     report=Part("ccatp.beacons.report.page:beacon_report"),
     conditions="ccatp.beacons.conditions",
+    waits={
+        "mapping": "waits until the motes have measured each other, then drives to the first waypoint",
+        "visiting": "stands for a moment before the move or until the danger loop permits it, then goes on by itself",
+        "following": "waits until the target moves away, then follows it",
+    },
+    stands=("mapping",),
     topics=Part("ccatp.beacons.links.topics:TOPICS"),
     commands=(Part("ccatp.beacons.cli.radio:radio"),),
     studies={

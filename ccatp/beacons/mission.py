@@ -1,5 +1,6 @@
 """A mission among beacons: set points from readings and the verdict of the danger loop. Time is an argument."""
 
+from enum import StrEnum
 from math import isfinite
 from typing import NamedTuple
 
@@ -7,6 +8,7 @@ from msgspec.structs import replace
 
 from ccatp.beacons.conditions import MISSION_TOO_LONG
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.modes import FOLLOWING, MAPPING, VISITING
 from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.steering import HALT, SteeringCommand
@@ -16,13 +18,9 @@ from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
 from ccatp.survey.events import (
     DONE,
-    FOLLOWING,
     HELD,
     IDLE,
-    MAPPING,
     RETURNING,
-    VISITING,
-    MissionState,
     SurveyInput,
     SurveyOutcome,
 )
@@ -110,7 +108,7 @@ class BeaconMission:
     def _finish(self, outcome: SurveyOutcome) -> None:
         self.state = replace(self.state, mode=DONE, outcome=outcome)
 
-    def _enter(self, mode: MissionState) -> None:
+    def _enter(self, mode: StrEnum) -> None:
         if self.state.mode is not mode:
             self.state = replace(self.state, mode=mode)
 

@@ -47,7 +47,7 @@ class WaitingTime(click.ParamType[float]):
 
 
 class ConfigFile(click.Path):
-    """The path of a configuration, or the name of a shipped one, such as zigbee."""
+    """The path of a configuration, or the name of a shipped one."""
 
     def __init__(self) -> None:
         super().__init__(path_type=Path)

@@ -67,7 +67,7 @@ def config_init(file: Path, force: bool) -> None:
     click.echo(f"{file}: uncomment what differs at your telescope, then ccatp config check {file}")
 
 
-@config.command("show", epilog=common.example("ccatp config show telescope.toml", "ccatp config show zigbee --json"))
+@config.command("show", epilog=common.example("ccatp config show", "ccatp config show telescope.toml --json"))
 @click.argument("file", type=common.CONFIG_FILE, required=False)
 @common.SETTINGS_OPTION
 @common.json_option("As one JSON object.")

@@ -27,14 +27,14 @@ WHEEL_BASE_M = Limits(0.03, 1.0)
 TOP_SPEED_M_S = Limits(0.02, 1.0)
 TTL_S = Limits(0.05, 1.0)
 FRAME_HZ = Limits(20.0, 200.0)
-# A robot among beacons drives on a floor, with an iteration of the mapping for each frame (2017 eq. 3).
-BEACON_FRAME_HZ = Limits(10.0, 200.0)
+# A robot with a vehicle drives on a floor, and may map while it drives: an iteration for each frame.
+VEHICLE_FRAME_HZ = Limits(10.0, 200.0)
 
 # Of a hello; ``top speed`` is max_wheel_rad_s * wheel_radius_m.
 LIMITS = {
     "ttl_s": (TTL_S, "s"),
     "frame_hz": (FRAME_HZ, "Hz"),
-    "frame_hz, with a vehicle": (BEACON_FRAME_HZ, "Hz"),
+    "frame_hz, with a vehicle": (VEHICLE_FRAME_HZ, "Hz"),
     "wheel_radius_m": (WHEEL_RADIUS_M, "m"),
     "wheel_base_m": (WHEEL_BASE_M, "m"),
     "top speed": (TOP_SPEED_M_S, "m/s"),
@@ -44,7 +44,7 @@ WheelRadius = Annotated[float, Field(ge=WHEEL_RADIUS_M.low, le=WHEEL_RADIUS_M.hi
 WheelBase = Annotated[float, Field(ge=WHEEL_BASE_M.low, le=WHEEL_BASE_M.high)]
 TimeToLive = Annotated[float, Field(ge=TTL_S.low, le=TTL_S.high)]
 FrameRate = Annotated[float, Field(ge=FRAME_HZ.low, le=FRAME_HZ.high)]
-BeaconFramePeriod = Annotated[float, Field(ge=1.0 / BEACON_FRAME_HZ.high, le=1.0 / BEACON_FRAME_HZ.low)]
+VehicleFramePeriod = Annotated[float, Field(ge=1.0 / VEHICLE_FRAME_HZ.high, le=1.0 / VEHICLE_FRAME_HZ.low)]
 
 
 def top_speed_problem(wheel_radius_m: float, max_wheel_rad_s: float) -> str | None:
@@ -61,10 +61,10 @@ def hello_problems(
     wheel_radius_m: float,
     wheel_base_m: float,
     max_wheel_rad_s: float,
-    is_among_beacons: bool,
+    has_vehicle: bool,
 ) -> list[str]:
     """Every value of a hello that is beyond its limits."""
-    rates_hz = BEACON_FRAME_HZ if is_among_beacons else FRAME_HZ
+    rates_hz = VEHICLE_FRAME_HZ if has_vehicle else FRAME_HZ
     found = (
         rates_hz.problem("frame_hz", frame_hz, " Hz"),
         TTL_S.problem("ttl_s", ttl_s, " s"),

@@ -43,7 +43,7 @@ from ccatp.links.rpc import Router
 from ccatp.links.topics import ESTIMATE_FRAMES, DangerEvent, MissionStatus
 from ccatp.missions import kind_of
 from ccatp.safety.escalation import Since
-from ccatp.survey.events import HELD, WAITS_FOR, Abort, Fault, Interrupted, Pause, Resume, StopHere
+from ccatp.survey.events import HELD, Abort, Fault, Interrupted, Pause, Resume, StopHere, waits_for
 from ccatp.survey.state import HoldState
 
 # The supervisor ends this process after it has received the last messages; a longer wait is reported.
@@ -291,7 +291,7 @@ class MainLoop(RobotLoop):
         if not why and alarms and not alarms[0].ended:
             why, advice = alarms[0].cause, alarms[0].advice
         if not why:
-            return f"{state.mode}, and nothing is wrong: {WAITS_FOR[state.mode]}"
+            return f"{state.mode}, and nothing is wrong: {waits_for(state.mode)}"
         otherwise = "'ccatp resume' continues" if state.is_paused else "continues by itself"
         return f"{state.mode}: {why}; {advice or otherwise}"
 

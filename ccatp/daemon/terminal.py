@@ -21,9 +21,9 @@ from ccatp.daemon.run_text import RunText, clock
 from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
-from ccatp.missions import kind_of
+from ccatp.missions import all_kinds, kind_of
 from ccatp.records.summary import format_table
-from ccatp.survey.events import DONE, HELD, IDLE, MAPPING, MEASURING, SETTLING, WAITS_FOR, MissionState
+from ccatp.survey.events import DONE, HELD, IDLE, MEASURING, SETTLING, waits_for
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
 # Signals that end a run, or the writing of its report.
@@ -181,7 +181,7 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
             signal.signal(number, handler)
 
 
-_STANDING = (IDLE, SETTLING, MEASURING, HELD, DONE, MAPPING)
+_STANDING = (IDLE, SETTLING, MEASURING, HELD, DONE)
 CODES = {0: "normal", 1: "near the mirror's edge", 2: "operation aborted"}
 BAR = 30
 _SHOWN = 10
@@ -234,8 +234,10 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def next_text(status: MissionStatus) -> str:
     """What a robot waits for that stands while nothing is wrong; empty if it moves, or its cause says why it stands."""
-    is_quiet = status.state in _STANDING and not (status.cause or status.alarms) and status.exit_status < 0
-    return WAITS_FOR[MissionState(status.state)] if is_quiet else ""
+    if status.cause or status.alarms or status.exit_status >= 0:
+        return ""
+    stands = status.state in _STANDING or any(status.state in kind.stands for kind in all_kinds())
+    return waits_for(status.state) if stands else ""
 
 
 def alarms_text(alarms: Sequence[Alarm]) -> str:

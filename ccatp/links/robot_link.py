@@ -271,7 +271,7 @@ class RobotLink(asyncio.Protocol):
             wheel_radius_m=robot.wheel_radius_m,
             wheel_base_m=robot.wheel_base_m,
             max_wheel_rad_s=robot.max_wheel_rad_s,
-            is_among_beacons=robot.vehicle is not None,
+            has_vehicle=robot.vehicle is not None,
         )
         if hello.protocol != PROTOCOL:
             error = f"the robot at {self._where} speaks {hello.protocol}, this program {PROTOCOL}"

@@ -32,7 +32,7 @@ class RobotLinkMessage(msgspec.Struct, tag_field="type", gc=False):
 
 
 class VehicleData(msgspec.Struct):
-    """Further data of a robot among beacons: its kind; directions of its distance sensors, rad, left of the heading."""
+    """Further data of a robot on a floor: its kind; directions of its distance sensors, rad, left of the heading."""
 
     kind: Literal["ackermann", "differential"]
     axle_distance_m: Positive

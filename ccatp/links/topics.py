@@ -140,7 +140,7 @@ class RobotShape(msgspec.Struct, omit_defaults=True):
     """An object on the map, in the plane of the pose; its ``id`` is the same in all messages."""
 
     id: str
-    kind: str  # for its symbol: beacon, obstacle, target, robot, trail; others get a default symbol
+    kind: str  # for its symbol, as obstacle, target, robot, trail; others get a default symbol
     x_m: float
     y_m: float
     covariance_m2: tuple[float, float, float] | None = None  # of x and y: xx, xy, yy; drawn as its ellipse

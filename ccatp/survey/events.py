@@ -1,15 +1,19 @@
 """Modes of a mission, events, the table of transitions, and the inputs that arrive between two frames."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from ccatp.control.gate import Purpose
 from ccatp.core import Cause, PointId
+from ccatp.missions import all_kinds
+
+M = TypeVar("M", bound=StrEnum)
 
 
 class MissionState(StrEnum):
-    """Mode of a mission."""
+    """Mode of a mission. Another kind of mission may have modes of its own, in which it may be held or end."""
 
     IDLE = "idle"
     TURNING = "turning"
@@ -20,26 +24,19 @@ class MissionState(StrEnum):
     RETURNING = "returning"
     HELD = "held"
     DONE = "done"
-    # Only in beacon missions:
-    MAPPING = "mapping"  # stands while motes map themselves
-    VISITING = "visiting"  # on the way to a waypoint
-    FOLLOWING = "following"  # behind the target
 
 
-IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE, *AMONG_BEACONS = MissionState
-MAPPING, VISITING, FOLLOWING = AMONG_BEACONS
-_MOVES = "stands for a moment before the move or until the danger loop permits it, then goes on by itself"
+IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE = MissionState
+MOVES = "stands for a moment before the move or until the danger loop permits it, then goes on by itself"
 # What a robot waits for that stands in a mode while nothing is wrong, and what happens then.
 WAITS_FOR = MappingProxyType(
     {
         IDLE: "waits for the robot, its laser system and the permit of the danger loop, then starts by itself",
-        **dict.fromkeys((TURNING, DRIVING, BACKING_OFF, RETURNING, VISITING), _MOVES),
+        **dict.fromkeys((TURNING, DRIVING, BACKING_OFF, RETURNING), MOVES),
         SETTLING: "waits until the wheels are at rest, then measures",
         MEASURING: "waits for the lengths of the laser system, then goes on to the next point",
         HELD: "goes on by itself when the cause of the hold is gone, else with 'ccatp resume'",
         DONE: "the run ends by itself",
-        MAPPING: "waits until the motes have measured each other, then drives to the first waypoint",
-        FOLLOWING: "waits until the target moves away, then follows it",
     }
 )
 
@@ -76,7 +73,7 @@ _SURVEYING = _ANYWHERE | {
 }
 _STOPPING = {MissionEvent.ARRIVED: SETTLING, MissionEvent.FIND: SETTLING}
 # (state, event) -> state. An edge precedes an abort: while backing off, GO_HOME has no effect. DONE is final.
-TRANSITIONS = MappingProxyType(
+TRANSITIONS: Mapping[StrEnum, Mapping[MissionEvent, MissionState]] = MappingProxyType(
     {
         IDLE: _SURVEYING | {MissionEvent.FIND: SETTLING},
         TURNING: _SURVEYING | _STOPPING | {MissionEvent.TURNED: DRIVING},
@@ -87,7 +84,6 @@ TRANSITIONS = MappingProxyType(
         RETURNING: _ANYWHERE | {MissionEvent.EDGE: BACKING_OFF, MissionEvent.FIND: SETTLING},
         HELD: _SURVEYING | {MissionEvent.FIND: SETTLING},
         DONE: {},
-        **dict.fromkeys(AMONG_BEACONS, _ANYWHERE),
     }
 )
 # The purpose for which the drive gate permits motion in a mode of a survey.
@@ -106,9 +102,16 @@ PURPOSES = MappingProxyType(
 )
 
 
-def next_state(state: MissionState, event: MissionEvent) -> MissionState:
+def next_state(state: M, event: MissionEvent) -> M | MissionState:
     """The state after ``event``; total over all pairs."""
-    return TRANSITIONS[state].get(event, state)
+    return TRANSITIONS.get(state, _ANYWHERE).get(event, state)
+
+
+def waits_for(state: str) -> str:
+    """What a robot waits for that stands in a mode of any mission while nothing is wrong; empty: it is not known."""
+    if state in WAITS_FOR:
+        return WAITS_FOR[MissionState(state)]
+    return next((kind.waits[state] for kind in all_kinds() if state in kind.waits), "")
 
 
 class Pause(NamedTuple):

@@ -1,7 +1,7 @@
 """State of a mission as one frozen value, and the state transitions that all missions share."""
 
 from collections.abc import Callable, Mapping, Sequence
-from enum import Enum
+from enum import Enum, StrEnum
 from math import inf
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -58,7 +58,7 @@ class Hold(NamedTuple):
 class HoldState(msgspec.Struct, frozen=True):
     """The part of the state that all missions share: mode, hold and causes. Times are robot time, s."""
 
-    mode: MissionState = IDLE
+    mode: StrEnum = IDLE
     outcome: SurveyOutcome = SurveyOutcome.NONE
     cause: Cause = NO_CAUSE
     hold: Hold = Hold()
@@ -108,6 +108,8 @@ class HoldState(msgspec.Struct, frozen=True):
 
 class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
     """The state of a survey."""
+
+    mode: MissionState = IDLE
 
     route: Route
     stop_index: int = 0  # of the stop driven to, or measured at

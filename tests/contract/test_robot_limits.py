@@ -13,10 +13,10 @@ from ccatp.commissioning.conformance.harness import CheckFailed, Facts, parse
 from ccatp.commissioning.probes import probe_robot
 from ccatp.config.load import load_config, load_onboard_config
 from ccatp.config.robot_limits import (
-    BEACON_FRAME_HZ,
     FRAME_HZ,
     TOP_SPEED_M_S,
     TTL_S,
+    VEHICLE_FRAME_HZ,
     WHEEL_BASE_M,
     WHEEL_RADIUS_M,
     Limits,
@@ -97,7 +97,7 @@ async def is_joined(hello: Hello) -> bool:
 async def test_a_client_joins_a_robot_within_the_limits_and_no_other(among_beacons: bool, measured: Measured) -> None:
     wrong = []
     for name, side, is_beyond in CASES:
-        limits = BEACON_FRAME_HZ if among_beacons and name == "frame_hz" else LIMITS[name]
+        limits = VEHICLE_FRAME_HZ if among_beacons and name == "frame_hz" else LIMITS[name]
         hello = with_value(BEACONS if among_beacons else HELLO, name, value_at(limits, side, is_beyond=is_beyond))
         if await is_joined(hello) is is_beyond:
             wrong.append((name, side, is_beyond))
@@ -141,7 +141,7 @@ KEYS = {
 @pytest.mark.parametrize(("name", "side"), [(name, side) for name in LIMITS for side in ("low", "high")])
 def test_no_configuration_has_a_robot_beyond_the_limits(kind: str, name: str, side: str) -> None:
     is_step = (kind, name) == ("beacons", "frame_hz")
-    value = value_at(BEACON_FRAME_HZ if is_step else LIMITS[name], side, is_beyond=True)
+    value = value_at(VEHICLE_FRAME_HZ if is_step else LIMITS[name], side, is_beyond=True)
     if is_step:
         overrides: dict[str, object] = {"run.step_s": 1.0 / value}
     elif name == "top_speed_m_s":
@@ -188,4 +188,4 @@ def test_the_simulated_robots_are_within_the_limits() -> None:
         robot, timing = hello.robot, {"frame_hz": hello.frame_hz, "ttl_s": hello.ttl_s}
         names = ("wheel_radius_m", "wheel_base_m", "max_wheel_rad_s")
         sizes = {name: getattr(robot, name) for name in names}
-        assert not hello_problems(**timing, **sizes, is_among_beacons=robot.vehicle is not None)
+        assert not hello_problems(**timing, **sizes, has_vehicle=robot.vehicle is not None)

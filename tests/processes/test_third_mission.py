@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from math import dist, hypot
+from math import dist
 from pathlib import Path
 
 import pytest
@@ -53,10 +53,10 @@ def test_a_third_kind_of_mission_runs(tmp_path: Path, runtime_dir: Path) -> None
             rows[one.topic] += json.loads(one.payload)["rows"]
     assert rows["square_track"]  # its own topic is recorded as well
     places = [tuple(row[2:4]) for row in rows["truth"]]
-    # Four sides of 0.1 m, and back to where it began: by time alone, wheels that slip less than a tenth.
-    assert sum(map(dist, places, places[1:])) == pytest.approx(4 * 0.1, abs=0.04)
-    assert hypot(*(a - b for a, b in zip(places[0], places[-1], strict=True))) < 0.04
-    assert max(dist(places[0], place) for place in places) == pytest.approx(0.1 * 2**0.5, abs=0.03)
+    # Four sides of 0.1 m, and back to where it began; 5 mm: the wheels lag in eight changes of speed, and slip.
+    assert sum(map(dist, places, places[1:])) == pytest.approx(4 * 0.1, abs=0.005)
+    assert dist(places[0], places[-1]) < 0.005
+    assert max(dist(places[0], place) for place in places) == pytest.approx(0.1 * 2**0.5, abs=0.005)
 
     report = ccatp(tmp_path, "report", str(run_dir))
     assert report.returncode == 2

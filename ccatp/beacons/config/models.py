@@ -22,7 +22,7 @@ from ccatp.config.models import (
     ProcessesConfig,
     Seed,
 )
-from ccatp.config.robot_limits import BeaconFramePeriod, TimeToLive, WheelBase, WheelRadius
+from ccatp.config.robot_limits import TimeToLive, VehicleFramePeriod, WheelBase, WheelRadius
 
 # Frames come ten times a second: what is older than two of them is stale.
 SlowFreshness = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -235,7 +235,7 @@ class RadioRunConfig(Model):
     """One run: clock, seed, end."""
 
     seed: Seed
-    step_s: BeaconFramePeriod  # one frame of the robot for each step
+    step_s: VehicleFramePeriod  # one frame of the robot for each step
     steps: Count
 
 

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from math import cos, inf, sin
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,7 @@ from ccatp.links.bus import Telemetry
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello
 from ccatp.links.topics import DisplayState, EstimateMessage, MissionStatus, RobotShape, Scene
-from ccatp.survey.events import DONE, HELD, IDLE, RETURNING, Fault, MissionState
+from ccatp.survey.events import DONE, HELD, IDLE, RETURNING, Fault
 
 if TYPE_CHECKING:
     from ccatp.daemon.main_loop import MainLoop
@@ -54,7 +55,7 @@ class BeaconRunner(MissionRunner):
         self._reader = MeasurementReader(cfg)
         self._measurements: BeaconMeasurements | None = None
         self._speed_m_s = 0.0
-        self._state: MissionState = IDLE
+        self._state: StrEnum = IDLE
         self._was_faulted = False
         self._published_arrivals = 0
         self._echoes: deque[tuple[float, float]] = deque(maxlen=ECHO_MEMORY)

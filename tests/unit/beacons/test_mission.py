@@ -13,6 +13,7 @@ from ccatp.beacons.conditions import RADIO_SILENT
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.links.messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.beacons.mission import RULES, BeaconMission, WaypointArrival, check_beacon_robot, permitted, wheel_rates
+from ccatp.beacons.modes import VISITING
 from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, PoseBelief, SelfMap, packets_of
 from ccatp.beacons.records.store import BeaconStore, BeaconStoreError
 from ccatp.beacons.records.summary import BeaconSummary
@@ -28,7 +29,7 @@ from ccatp.errors import ConfigError
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
-from ccatp.survey.events import DONE, HELD, VISITING, Abort, Fault, Pause, Resume, StopHere
+from ccatp.survey.events import DONE, HELD, Abort, Fault, Pause, Resume, StopHere
 from ccatp.survey.state import HoldState
 from tests.support.scenario import radio_config_of
 

@@ -13,7 +13,7 @@ from ccatp.config.models import LimitsConfig
 from ccatp.control.gate import Denial, DriveGate, FanGate, Purpose
 from ccatp.core import EventCode, Twist, Verdict, twist_of, wheel_rates
 from ccatp.daemon.survey_runner import GateLog
-from ccatp.survey.events import AMONG_BEACONS, PURPOSES, MissionState
+from ccatp.survey.events import PURPOSES, MissionState
 from tests.support.scenario import config_of
 
 LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.8, alpha_max_rad_s2=2.0)
@@ -104,7 +104,7 @@ def test_what_is_denied_and_why(
 
 
 def test_every_state_has_a_purpose_and_those_that_stand_deny() -> None:
-    assert set(PURPOSES) == set(MissionState) - set(AMONG_BEACONS)
+    assert set(PURPOSES) == set(MissionState)
     moving = {state for state, purpose in PURPOSES.items() if denial(SLOW, purpose=purpose) is None}
     assert moving == {MissionState.TURNING, MissionState.DRIVING, MissionState.BACKING_OFF, MissionState.RETURNING}
     assert denial(SLOW, purpose=Purpose.STAND) is Denial.STATE

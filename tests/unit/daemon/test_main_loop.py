@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from enum import StrEnum
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -11,6 +12,7 @@ import msgspec
 import pytest
 import zmq
 
+from ccatp.beacons.modes import BeaconMode
 from ccatp.config.load import load_config
 from ccatp.daemon.main_loop import STANDS_REPORT_S, MainLoop
 from ccatp.daemon.mission_runner import MissionRunner
@@ -18,7 +20,7 @@ from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.daemon.terminal import next_text, status_rows
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import MissionStatus
-from ccatp.survey.events import WAITS_FOR, MissionState
+from ccatp.survey.events import WAITS_FOR, MissionState, waits_for
 from ccatp.survey.state import HoldState
 
 
@@ -55,7 +57,7 @@ def test_a_process_that_failed_publishes_no_end_of_the_run(loop: MainLoop) -> No
     assert loop.status().exit_status == -1
 
 
-def standing(mode: MissionState, said: list[str]) -> SimpleNamespace:
+def standing(mode: StrEnum, said: list[str]) -> SimpleNamespace:
     """A runner whose robot stands in a mode, with nothing wrong."""
     telemetry = SimpleNamespace(
         flush=lambda _: None, send=lambda *_: None, seq=-1, notify_operator=lambda _, text: said.append(text)
@@ -71,9 +73,9 @@ def standing(mode: MissionState, said: list[str]) -> SimpleNamespace:
     )
 
 
-@pytest.mark.parametrize("mode", MissionState)
+@pytest.mark.parametrize("mode", [*MissionState, *BeaconMode])
 def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
-    loop: MainLoop, monkeypatch: pytest.MonkeyPatch, mode: MissionState
+    loop: MainLoop, monkeypatch: pytest.MonkeyPatch, mode: StrEnum
 ) -> None:
     said: list[str] = []
     now_s = 1000.0
@@ -85,13 +87,14 @@ def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
         now_s += 0.3 * STANDS_REPORT_S
         loop.heartbeat.frame_s = now_s
         loop.publish_levels()
-    assert said == [f"the robot stands for 36 s: {mode}, and nothing is wrong: {WAITS_FOR[mode]}"]
+    assert said == [f"the robot stands for 36 s: {mode}, and nothing is wrong: {waits_for(mode)}"]
+    assert waits_for(mode)
 
 
 def test_the_status_of_a_robot_that_stands_says_what_is_next() -> None:
     assert next_text(MissionStatus(seq=0, t_s=0.0, state="idle")) == WAITS_FOR[MissionState.IDLE]
     for told in ({"cause": "operator"}, {"exit_status": 0}):
         assert next_text(MissionStatus(seq=0, t_s=0.0, state="idle", **told)) == ""
-    for moving in (MissionState.DRIVING, MissionState.FOLLOWING):
+    for moving in (MissionState.DRIVING, BeaconMode.FOLLOWING):
         assert next_text(MissionStatus(seq=0, t_s=0.0, state=str(moving))) == ""
     assert next_text(MissionStatus(seq=-1, t_s=0.0, state="")) == ""

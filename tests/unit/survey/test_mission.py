@@ -13,7 +13,6 @@ from ccatp.core import Cause, DeckPose, PointId, Predicted, Severity, Stop, Stop
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.events import (
-    AMONG_BEACONS,
     Abort,
     EstimateDiverged,
     Fault,
@@ -51,7 +50,7 @@ def test_the_table_is_total_and_hold_is_one_event_away() -> None:
         assert next_state(state, event) in MissionState
     for state in set(MissionState) - {MissionState.DONE}:
         assert next_state(state, MissionEvent.HOLD) is MissionState.HELD
-    for state in set(MissionState) - {MissionState.BACKING_OFF, MissionState.DONE, *AMONG_BEACONS}:
+    for state in set(MissionState) - {MissionState.BACKING_OFF, MissionState.DONE}:
         assert next_state(state, MissionEvent.EDGE) is MissionState.BACKING_OFF
     assert {next_state(MissionState.DONE, event) for event in MissionEvent} == {MissionState.DONE}
     assert (
