@@ -6,7 +6,7 @@ a fault is found; that of an emergency stays unless a return or a fault is found
 at a time. ``docs/alarms.md`` is generated from these rows. A mission may register rows of its own from another file.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum, StrEnum
 from functools import cache, partial
@@ -15,7 +15,7 @@ from math import isfinite
 from typing import NamedTuple, ParamSpec
 
 from ccatp.core import ALL_MOTION, NO_MOTION, Cause, EventCode, Permits, Severity, Verdict
-from ccatp.missions import all_kinds
+from ccatp.missions import SEARCHED, MissionKind, all_kinds
 
 
 class Motion(Enum):
@@ -201,22 +201,24 @@ P = ParamSpec("P")
 
 
 @cache
-def _register_all() -> None:
-    for kind in all_kinds():
+def _register(kinds: Callable[[], Iterable[MissionKind]]) -> None:
+    for kind in kinds():
         if kind.conditions:
             import_module(kind.conditions)
 
 
 def find_condition(name: str) -> Condition | None:
     """The row of a name; ``None``: no kind of mission has it, or there is no cause."""
-    if name and name not in TABLE:
-        _register_all()
+    for kinds in SEARCHED:
+        if not name or name in TABLE:
+            break
+        _register(kinds)
     return TABLE.get(name)
 
 
 def all_conditions() -> tuple[Condition, ...]:
     """The rows of every kind of mission."""
-    _register_all()
+    _register(all_kinds)
     return tuple(TABLE.values())
 
 

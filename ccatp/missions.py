@@ -35,14 +35,16 @@ class MissionKind:
 
     ``systems``: values of ``system`` in its configurations. ``title``: a mission of this kind, in messages.
     ``subject``: what its ``RunText.subject`` is, in log and recording. ``no_resume``: why no mission can be continued
-    from its run directory; ``None``: it can. ``conditions``: module whose import registers the kind's own rows; empty:
-    none. ``waits``: what the robot waits for in modes that only this kind has; in those of ``stands`` it does not move.
+    from its run directory; ``None``: it can. ``no_faults``: why its simulated robot takes no fault plan, with advice;
+    ``None``: it takes one. ``conditions``: module whose import registers the kind's own rows; empty: none. ``waits``:
+    what the robot waits for in modes that only this kind has; in those of ``stands`` it does not move.
     """
 
     systems: tuple[str, ...]
     title: str
     subject: str = "system"
     no_resume: str | None = None
+    no_faults: str | None = "plans are for surveys; leave it out"
     # Configuration. ``C`` below is its class, which has what ``config.mission.MissionConfig`` lists.
     load: Part  # config.load.LoadConfig
     shipped: Part | None = None  # Callable[[C], C]: what a configuration is compared with, if not that of its system
@@ -88,9 +90,13 @@ def all_kinds() -> tuple[MissionKind, ...]:
     return (*built_in(), *_of_others())
 
 
+# What is searched for a name, in this order: the installed packages only for one that is not known here.
+SEARCHED = built_in, all_kinds
+
+
 def find_kind(system: object) -> MissionKind | None:
     """The kind whose configurations name ``system``; ``None``: there is none."""
-    for kinds in (built_in, _of_others):
+    for kinds in SEARCHED:
         for kind in kinds():
             if system in kind.systems:
                 return kind

@@ -51,10 +51,13 @@ def sim_robot(
     Standard error says if it fell, and why; then the exit status is 4.
     """
     from ccatp.config.load import load_mission
+    from ccatp.daemon.run_dir import check_takes_faults
     from ccatp.daemon.sim_robot import run_alone
+    from ccatp.missions import kind_of
     from ccatp.sim.fault_plan import read_plan
 
     cfg = load_mission(config_file, settings)
+    check_takes_faults(kind_of(cfg), faults_file)
     plan = None if faults_file is None else read_plan(faults_file, lockstep=not realtime)
     return int(run_alone(cfg, lockstep=not realtime, faults=plan, runtime_dir=runtime_dir))
 

@@ -18,7 +18,7 @@ from ccatp.daemon.danger_loop import FILE as EMERGENCIES
 from ccatp.daemon.run_text import RunText
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import BESIDE, LOCK_FILE, TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
-from ccatp.missions import kind_of
+from ccatp.missions import MissionKind, kind_of
 from ccatp.records.recorder import TELEMETRY, read_metadata
 
 FILE = Path("runs") / "unfinished"
@@ -271,6 +271,12 @@ def keep_origin(run_dir: Path, *, is_sim: bool, is_new: bool) -> None:
     """Save the id of a run, and whether it is simulated, for ``with_origin``; a resumed run keeps its id."""
     run_id = uuid4().hex if is_new else read_run_id(run_dir)
     write_durably(run_dir / ORIGIN_FILE, json.dumps({"simulation": is_sim, "run_id": run_id}).encode())
+
+
+def check_takes_faults(kind: MissionKind, faults_file: Path | None) -> None:
+    """Raises ``ConfigError``: there is a fault plan, and the simulated robot of this kind of mission takes none."""
+    if faults_file is not None and kind.no_faults is not None:
+        raise ConfigError(f"--faults: {kind.no_faults}")
 
 
 def _folder_of(cfg: MissionConfig) -> str:

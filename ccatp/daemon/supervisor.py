@@ -37,6 +37,7 @@ from ccatp.daemon.process import ADDRESSES_FILE, FAULTS_FILE, RUN_DIR_FILE, Endp
 from ccatp.daemon.run_dir import (
     RunOptions,
     await_predecessors,
+    check_takes_faults,
     finished_summary,
     keep_origin,
     make_run_dir,
@@ -295,6 +296,7 @@ def _run(options: RunOptions, cfg: MissionConfig) -> int:
     options = with_origin(options)
     permit_open_files()
     kind = kind_of(cfg)
+    check_takes_faults(kind, options.faults_file)
     if kind.check is not None:
         check: Callable[[RunOptions, Any], None] = kind.check.get()
         check(options, cfg)

@@ -21,9 +21,9 @@ from ccatp.daemon.run_text import RunText, clock
 from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
-from ccatp.missions import all_kinds, kind_of
+from ccatp.missions import SEARCHED, kind_of
 from ccatp.records.summary import format_table
-from ccatp.survey.events import DONE, HELD, IDLE, MEASURING, SETTLING, waits_for
+from ccatp.survey.events import DONE, HELD, IDLE, MEASURING, SETTLING, WAITS_FOR, waits_for
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
 # Signals that end a run, or the writing of its report.
@@ -236,7 +236,9 @@ def next_text(status: MissionStatus) -> str:
     """What a robot waits for that stands while nothing is wrong; empty if it moves, or its cause says why it stands."""
     if status.cause or status.alarms or status.exit_status >= 0:
         return ""
-    stands = status.state in _STANDING or any(status.state in kind.stands for kind in all_kinds())
+    stands = status.state in _STANDING
+    if status.state not in WAITS_FOR:
+        stands = any(status.state in kind.stands for kinds in SEARCHED for kind in kinds())
     return waits_for(status.state) if stands else ""
 
 

@@ -3,6 +3,7 @@
 Liveness, recording and displays use the table; a new topic needs one row. Levels are repeated at their rate.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
@@ -10,7 +11,7 @@ from typing import Any, Literal
 import msgspec
 
 from ccatp.core import Verdict
-from ccatp.missions import MissionKind, all_kinds
+from ccatp.missions import SEARCHED, MissionKind, all_kinds
 
 
 class Message(msgspec.Struct, kw_only=True):
@@ -331,8 +332,8 @@ def topics_of(kind: MissionKind) -> tuple[Topic, ...]:
 
 
 @cache
-def _add_topics_of_kinds() -> None:
-    BY_NAME.update((topic.name, topic) for kind in all_kinds() for topic in topics_of(kind))
+def _add_topics(kinds: Callable[[], Iterable[MissionKind]]) -> None:
+    BY_NAME.update((topic.name, topic) for kind in kinds() for topic in topics_of(kind))
 
 
 def all_topics() -> tuple[Topic, ...]:
@@ -342,8 +343,10 @@ def all_topics() -> tuple[Topic, ...]:
 
 def find_topic(name: str) -> Topic | None:
     """The row of a topic; ``None``: no kind of mission has it."""
-    if name not in BY_NAME:
-        _add_topics_of_kinds()
+    for kinds in SEARCHED:
+        if name in BY_NAME:
+            break
+        _add_topics(kinds)
     return BY_NAME.get(name)
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeVar
 
 from ccatp.control.gate import Purpose
 from ccatp.core import Cause, PointId
-from ccatp.missions import all_kinds
+from ccatp.missions import SEARCHED
 
 M = TypeVar("M", bound=StrEnum)
 
@@ -111,7 +111,7 @@ def waits_for(state: str) -> str:
     """What a robot waits for that stands in a mode of any mission while nothing is wrong; empty: it is not known."""
     if state in WAITS_FOR:
         return WAITS_FOR[MissionState(state)]
-    return next((kind.waits[state] for kind in all_kinds() if state in kind.waits), "")
+    return next((kind.waits[state] for kinds in SEARCHED for kind in kinds() if state in kind.waits), "")
 
 
 class Pause(NamedTuple):

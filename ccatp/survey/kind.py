@@ -7,6 +7,7 @@ SURVEY = MissionKind(
     systems=(NAME,),
     title="survey of a mirror",
     subject="mirror",
+    no_faults=None,
     load=Part("ccatp.config.load:load_config"),
     shipped=Part("ccatp.config.describe:shipped_config"),
     text=Part("ccatp.daemon.survey_run:survey_text"),

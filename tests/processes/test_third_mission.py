@@ -71,3 +71,14 @@ def test_an_unknown_kind_of_mission_is_one_clear_line(tmp_path: Path) -> None:
         assert (refused.returncode, refused.stdout) == (2, "")
         (line,) = refused.stderr.splitlines()
         assert f'{config}:2: system = "sqare" is no system; did you mean square?' in line
+
+
+def test_a_fault_plan_for_a_robot_that_takes_none_is_refused(tmp_path: Path) -> None:
+    config, plan = tmp_path / "square.toml", tmp_path / "plan.toml"
+    config.write_text('system = "square"\n')
+    plan.write_text('[[fault]]\nsignal = "frames"\ntype = "drop"\nevery = 2\nat_s = 0.1\nfor_s = 0.1\n')
+    for command in (("run", "--sim"), ("sim", "robot")):
+        refused = ccatp(tmp_path, *command, "--config", str(config), "--faults", str(plan))
+        assert (refused.returncode, refused.stdout) == (2, "")
+        (line,) = refused.stderr.splitlines()
+        assert "--faults: plans are for surveys" in line

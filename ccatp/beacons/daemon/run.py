@@ -1,12 +1,10 @@
-"""A run of a mission among beacons: its processes, its texts, what is checked before it begins."""
+"""A run of a mission among beacons: its processes and its texts."""
 
 from dataclasses import replace
 
 from ccatp.beacons.config.models import RadioConfig
-from ccatp.daemon.run_dir import RunOptions
 from ccatp.daemon.run_text import RunText, progress_text
 from ccatp.daemon.supervisor import WITHOUT_LASER
-from ccatp.errors import ConfigError
 from ccatp.links.topics import MissionStatus
 
 # Positions come from radio. When main dies, its map is lost, and the run ends, held.
@@ -27,9 +25,3 @@ def beacon_text(cfg: RadioConfig) -> RunText:
 def _progress(status: MissionStatus) -> str:
     state = status.state + (f" ({status.cause})" if status.cause else "")
     return progress_text(status, state, f"position known to {0.1 * status.error_mm:.1f} cm")
-
-
-def check_beacon_run(options: RunOptions, _cfg: RadioConfig) -> None:
-    """Raises ``ConfigError``: there is a fault plan."""
-    if options.faults_file is not None:
-        raise ConfigError("--faults: plans are for surveys; sim.incidents of the configuration holds those of beacons")
