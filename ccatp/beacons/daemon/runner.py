@@ -236,7 +236,7 @@ class BeaconRunner(MissionRunner):
         x_m, y_m, heading_rad = belief.pose
         target = cfg.follow.target if cfg.follow.is_active else None
         shapes = [
-            RobotShape(f"beacon {name}", "target" if name == target else "beacon", *e[:2], e[2:], label=name)
+            RobotShape(f"beacon {name}", "target" if name == target else "landmark", *e[:2], e[2:], label=name)
             for name, e in beacons.items()
         ]
         shapes += [

@@ -188,11 +188,11 @@ def test_the_alarms_are_those_of_the_status_until_the_run_is_over(view: SurveyVi
 
 def test_other_things_on_the_map(view: SurveyView) -> None:
     assert "shapes" not in reported(view)
-    beacon = RobotShape(id="b1", kind="beacon", x_m=1.0, y_m=2.0, covariance_m2=(0.1, 0.0, 0.1), label="b1")
+    beacon = RobotShape(id="b1", kind="landmark", x_m=1.0, y_m=2.0, covariance_m2=(0.1, 0.0, 0.1), label="b1")
     wall = RobotShape(id="w", kind="obstacle", x_m=0.0, y_m=0.0, outline_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)])
     shapes = reported(view, Scene(seq=1, t_s=1.0, shapes=[beacon, wall]))["shapes"]
     place = {"x_m": 1.0, "y_m": 2.0, "covariance_m2": [0.1, 0.0, 0.1]}
-    assert shapes[0] == {"id": "b1", "kind": "beacon", "label": "b1"} | place
+    assert shapes[0] == {"id": "b1", "kind": "landmark", "label": "b1"} | place
     assert shapes[1]["outline_m"] == [[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
     assert "shapes" not in reported(view)  # nothing new
     assert len(view.everything(1.1)["shapes"]) == 2
@@ -383,10 +383,10 @@ def test_the_error_against_the_truth_is_the_worst_of_each_second(room: BeaconVie
 
 
 def test_the_scene_without_what_the_page_draws_itself(room: BeaconView) -> None:
-    kinds = ("robot", "trail", "waypoint", "beacon", "obstacle")
+    kinds = ("robot", "trail", "waypoint", "landmark", "obstacle")
     scene = Scene(seq=1, t_s=1.0, shapes=[RobotShape(kind, kind, 1.0, 1.0) for kind in kinds])
     state = reported(room, BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 1.0)}), scene)
-    assert [shape["kind"] for shape in state["shapes"]] == ["true", "beacon", "obstacle"]
+    assert [shape["kind"] for shape in state["shapes"]] == ["true", "landmark", "obstacle"]
     assert state["shapes"][0]["y_m"] == 1.0
     assert [link["name"] for link in state["links"]] == ["main loop", "danger loop", "robot"]  # no laser
 

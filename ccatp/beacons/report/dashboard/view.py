@@ -16,6 +16,8 @@ from ccatp.report.dashboard.view import MEASURED, PLANNED, RunStateView
 
 CODES = ["normal operation", "near something", "operation aborted"]
 TITLES = {"zigbee": "ZigBee beacons", "follow": "Following a radio", "cricket": "Ultrasonic motes"}
+# Sign, ink and words of the points on the map.
+LEGEND = [["\u25cb", "todo", "waypoint"], ["\u25cf", "good", "reached"], ["\u25b2", "estimate", "beacon"]]
 # Elements of the page that only a survey has.
 HIDDEN = ["edges", "skipped-row", "eta-row", "finish-row"]
 
@@ -54,6 +56,7 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool) -> dict[str, Any]:
         "plots": {name: [] for name in ("error", "map", *last)} | {"nis": [[1.0, "expected"]]},
         "limits": {"sensors_age_s": cfg.robot.sensors_timeout_s, "permit_age_s": cfg.danger.stale_after_s},
         "hides": HIDDEN,
+        "legend": LEGEND,
         "words": {
             "simulation-what": "robot, radios and motes are simulated",
             "progress-head": "Following" if is_following else "Waypoints",

@@ -16,7 +16,7 @@ const INKS = ["ink", "quiet", "card", "line", "panel", "seam", "rim", "good", "n
 
 // How things look: each gets the pen (with its colours), the place in pixels, the size of a metre, and the thing.
 const LOOKS = {
-  beacon: (pen, x, y) => polygon(pen, [[x, y - 8], [x + 7, y + 5], [x - 7, y + 5]], pen.inks.estimate),
+  landmark: (pen, x, y) => polygon(pen, [[x, y - 8], [x + 7, y + 5], [x - 7, y + 5]], pen.inks.estimate),
   target: (pen, x, y) => polygon(pen, [[x, y - 7], [x + 7, y], [x, y + 7], [x - 7, y]], pen.inks.note),
   robot: (pen, x, y) => disc(pen, x, y, 6, pen.inks.ink),
   obstacle: (pen, x, y, scale, shape) => {
@@ -93,7 +93,7 @@ export class MapView {
     this.draw();
   }
 
-  // Among beacons the ellipses are as large as the room.
+  // In a room without panels the ellipses are as large as the room.
   get magnified() {
     return this.ground.panels.length ? this.chosen : 1;
   }
@@ -103,9 +103,8 @@ export class MapView {
     this.ellipseButton.textContent = `3σ ×${this.magnified}`;
     const tolerance = `${this.ground.arrival_tolerance_mm} mm`;
     const ofSurvey = [["○", "todo", "planned"], ["●", "good", `within ${tolerance}`], ["▲", "warn", `beyond ${tolerance}`], ["✕", "warn", "not measured"]];
-    const ofRoom = [["○", "todo", "waypoint"], ["●", "good", "reached"], ["▲", "estimate", "beacon"]];
     const items = [
-      ...(this.ground.panels.length ? ofSurvey : ofRoom),
+      ...(this.ground.legend ?? ofSurvey),
       ["◎", "note", "next"],
       ["━", "estimate", "driven path"],
       ["◯", "estimate", `3σ ellipse × ${this.magnified}`],
