@@ -22,9 +22,10 @@ from math import isfinite
 import msgspec
 
 from ccatp import conditions
+from ccatp.clocks import SteadyTime
 from ccatp.conditions import MonitorFinding
 from ccatp.config.models import Config, DangerConfig, HealthConfig, RobotConfig
-from ccatp.core import NO_MOTION, Corner, EdgeSample, EventCode, Permits, SteadyTime, Verdict, WheelSample
+from ccatp.core import NO_MOTION, Corner, EdgeSample, EventCode, Permits, Verdict, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror

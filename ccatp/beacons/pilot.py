@@ -17,7 +17,7 @@ from ccatp.beacons.steering import (
     WaypointSteering,
     aim_at,
 )
-from ccatp.core import bearing, wrap_pi
+from ccatp.kinematics import bearing, wrap_pi
 
 _NEAREST_M = 0.02  # lower limit of a distance, below which the direction is meaningless
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from ccatp.beacons.config.models import FuzzyConfig, RadioControlConfig, VehicleConfig
 from ccatp.control.tracker import Pid, PidState
-from ccatp.core import bearing, wrap_pi
+from ccatp.kinematics import bearing, wrap_pi
 
 _Trapezoid = tuple[float, float, float, float]
 

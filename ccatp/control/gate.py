@@ -9,7 +9,8 @@ from math import isfinite
 
 from ccatp.conditions import FANS_REFUSED
 from ccatp.config.models import LimitsConfig, RobotConfig
-from ccatp.core import Cause, EventCode, Twist, Verdict, wheel_rates
+from ccatp.core import Cause, EventCode, Twist, Verdict
+from ccatp.kinematics import wheel_rates
 
 HELD = Twist(0.0, 0.0)
 # Part of the limits: room for the feedback, and for the feed-forward of the wheel lag, which adds T a to the speed.

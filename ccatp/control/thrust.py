@@ -18,7 +18,8 @@ from typing import NamedTuple
 from scipy.optimize import brentq
 
 from ccatp.config.models import RobotConfig
-from ccatp.core import GRAVITY_M_S2, DeckPose, Vector3, difference
+from ccatp.core import GRAVITY_M_S2, DeckPose, Vector3
+from ccatp.kinematics import difference
 from ccatp.mirror.mirror import Mirror
 
 _RAMP_PER_S = 1.0  # of the duty

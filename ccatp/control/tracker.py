@@ -12,7 +12,8 @@ from msgspec.structs import replace
 
 from ccatp.config.models import ControlConfig, GainsConfig, LimitsConfig, PidConfig
 from ccatp.control.wheel_motion import Pose
-from ccatp.core import Predicted, Twist, wrap_pi
+from ccatp.core import Predicted, Twist
+from ccatp.kinematics import wrap_pi
 
 
 class PidState(msgspec.Struct, frozen=True):

@@ -10,6 +10,7 @@ from typing import Any
 import zmq
 from msgspec.structs import replace
 
+from ccatp.clocks import MissionClock
 from ccatp.conditions import (
     FRAME_LATE,
     FRAMES_OLD,
@@ -21,7 +22,7 @@ from ccatp.conditions import (
     find_condition,
     text_of,
 )
-from ccatp.core import MissionClock, Severity, Verdict
+from ccatp.core import Severity, Verdict
 from ccatp.daemon.alarms import ActiveCause, AlarmList, active_cause
 from ccatp.daemon.mission_runner import STILL, DriveCommand, LoopLimits, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs, run_process, start_process

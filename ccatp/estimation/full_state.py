@@ -6,7 +6,7 @@ from math import atan2, cos, hypot, inf, sin, sqrt
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, Fix, FloatArray, PanelPose, wrap_pi
+from ccatp.core import DeckPose, Fix, FloatArray, PanelPose
 from ccatp.estimation.fixes import FixGated
 from ccatp.estimation.localizer_base import (
     LONGEST_GAP_S,
@@ -28,6 +28,7 @@ from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import POSE, POSITION, STATES, V, W
 from ccatp.estimation.wheel_coast import CoastedMotion, WheelInput
 from ccatp.filters.base import FilterDiverged, Innovation
+from ccatp.kinematics import wrap_pi
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
 

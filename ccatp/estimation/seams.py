@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.config.models import LocalizerConfig, RobotConfig
-from ccatp.core import DeckPose, EdgeSample, FloatArray, PanelId, PanelPose, rotate
+from ccatp.core import DeckPose, EdgeSample, FloatArray, PanelId, PanelPose
 from ccatp.estimation.localizer_base import EdgeScanner, SensorTransition
 from ccatp.estimation.odometry import Odometer, OdometryPose, Slope, axes_on
 from ccatp.estimation.state_model import E0, E1, PSI, STATES, A, V, W, X
+from ccatp.kinematics import rotate
 from ccatp.mirror.layout import Seam
 from ccatp.mirror.mirror import Mirror
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.control.thrust import TurnCreep
-from ccatp.core import DeckPose, FloatArray, PanelId, difference
+from ccatp.core import DeckPose, FloatArray, PanelId
 from ccatp.estimation import state_model as sm
 from ccatp.estimation.fixes import fix_row, relocated
 from ccatp.estimation.localizer_base import SensorTransition
@@ -18,6 +18,7 @@ from ccatp.estimation.seams import SeamLines
 from ccatp.estimation.slip_prior import SlipPrior
 from ccatp.estimation.wheel_coast import CoastedMotion
 from ccatp.filters.base import Filter, Innovation
+from ccatp.kinematics import difference
 from ccatp.mirror.mirror import Mirror
 
 _STOP_ROWS = np.eye(sm.STATES)[sm.SPEEDS]

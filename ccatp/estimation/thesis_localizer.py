@@ -7,18 +7,7 @@ from math import hypot, inf, sqrt
 import numpy as np
 
 from ccatp.config.models import Config, LocalizerConfig, RobotConfig
-from ccatp.core import (
-    DeckPose,
-    Fix,
-    FloatArray,
-    PanelId,
-    PanelPose,
-    Twist,
-    difference,
-    rotate,
-    wheel_rates,
-    wrap_pi,
-)
+from ccatp.core import DeckPose, Fix, FloatArray, PanelId, PanelPose, Twist
 from ccatp.estimation.localizer_base import (
     MAX_FRAME_STEP_S,
     Edges,
@@ -34,6 +23,7 @@ from ccatp.estimation.odometry import Odometer, arc_step
 from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate
 from ccatp.estimation.wheel_coast import WheelInput
 from ccatp.filters.base import FilterDiverged, Innovation
+from ccatp.kinematics import difference, rotate, wheel_rates, wrap_pi
 from ccatp.mirror.mirror import Mirror
 
 V, A, THETA, OMEGA = range(4)

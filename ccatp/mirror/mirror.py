@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from ccatp.config.models import MirrorConfig
-from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, PointId, Vector3, wrap_pi
+from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, PointId, Vector3
+from ccatp.kinematics import wrap_pi
 from ccatp.mirror.layout import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, PanelGrid
 from ccatp.mirror.rim import build_rim
 from ccatp.mirror.surface import Axes, Surface, UnknownPanelError, build_surface

@@ -9,7 +9,8 @@ from collections import deque
 from math import hypot, inf, isfinite
 from typing import Any, Literal
 
-from ccatp.core import ALL_MOTION, Permits, twist_of
+from ccatp.core import ALL_MOTION, Permits
+from ccatp.kinematics import twist_of
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role
 from ccatp.slide_rule import SlideRule
 

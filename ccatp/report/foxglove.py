@@ -23,8 +23,9 @@ import numpy as np
 import zmq
 
 from ccatp.config.checks import is_loopback
-from ccatp.core import DeckPose, PanelId, PanelPose, PointId, Vector3, wrap_pi
+from ccatp.core import DeckPose, PanelId, PanelPose, PointId, Vector3
 from ccatp.errors import UsageError
+from ccatp.kinematics import wrap_pi
 from ccatp.links import topics
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage, Message, TrackMessage, TruthMessage

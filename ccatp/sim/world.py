@@ -7,7 +7,8 @@ from math import hypot, inf
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, PanelId, PanelPose, Vector3, wrap_pi
+from ccatp.core import DeckPose, PanelId, PanelPose, Vector3
+from ccatp.kinematics import wrap_pi
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.rim import NearOutline

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from ccatp.config.models import Config, ControlConfig, LimitsConfig, PidConfig
-from ccatp.core import FloatArray, wrap_pi
+from ccatp.core import FloatArray
+from ccatp.kinematics import wrap_pi
 from ccatp.report.plots import INK, QUIET
 from ccatp.studies.campaign import CampaignError
 from ccatp.studies.results import plot, write_analysis

@@ -18,9 +18,10 @@ from ccatp.conditions import GRIP_LOST
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.thrust import ThrustControl, forecast_grip
-from ccatp.core import DeckPose, EventCode, PanelId, Twist, Verdict, wheel_rates
+from ccatp.core import DeckPose, EventCode, PanelId, Twist, Verdict
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import motor_robot
+from ccatp.kinematics import wheel_rates
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.physics import PhysicsPlant

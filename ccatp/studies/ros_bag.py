@@ -18,7 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores import ros2_jazzy as ros
 
 from ccatp.config.models import Config
-from ccatp.core import Corner, DeckPose, FloatArray, PanelId, PanelPose, Severity, twist_of
+from ccatp.core import Corner, DeckPose, FloatArray, PanelId, PanelPose, Severity
+from ccatp.kinematics import twist_of
 from ccatp.links.bus import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors

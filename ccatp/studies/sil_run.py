@@ -13,26 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from ccatp.clocks import SteadyTime
 from ccatp.conditions import text_of
 from ccatp.config.models import Config
-from ccatp.core import (
-    DeckPose,
-    EventCode,
-    Fix,
-    FloatArray,
-    Measured,
-    PanelPose,
-    PointId,
-    SteadyTime,
-    Verdict,
-    difference,
-    unreliable_points,
-)
+from ccatp.core import DeckPose, EventCode, Fix, FloatArray, Measured, PanelPose, PointId, Verdict, unreliable_points
 from ccatp.daemon.mission_runner import STILL, DriveCommand, TimedFrame
 from ccatp.daemon.survey_runner import SurveyFrames
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import MotorRobot, motor_robot
 from ccatp.estimation.fixes import FixGated, FixRefused
+from ccatp.kinematics import difference
 from ccatp.links import multiline
 from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors

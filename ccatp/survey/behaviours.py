@@ -9,7 +9,8 @@ from msgspec.structs import replace
 from ccatp.conditions import RIM_AHEAD
 from ccatp.config.models import ControlConfig, MissionConfig
 from ccatp.control.tracker import LegMotion, LegPhase, LegTracker
-from ccatp.core import EventCode, PanelPose, PointId, Stop, StopKind, Twist, Verdict, difference
+from ccatp.core import EventCode, PanelPose, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.kinematics import difference
 from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
 
 # Tolerance for the rounding of sums of frame periods, which must not cost a frame.

@@ -6,7 +6,8 @@ from math import acos, atan2, degrees, dist, hypot, pi, radians, sqrt
 from statistics import median
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, Vector3, wrap_pi
+from ccatp.core import DeckPose, Vector3
+from ccatp.kinematics import wrap_pi
 from ccatp.mirror.mirror import Mirror
 
 _EARLY = 1.05  # factor for the charge used between the decision and the start of the motion

@@ -13,7 +13,8 @@ from msgspec.structs import replace
 from ccatp.config.models import Config
 from ccatp.control.thrust import TurnCreep
 from ccatp.control.tracker import DONE, LegMotion, LegTracker
-from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, Predicted, Stop, StopKind, Twist, difference
+from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, Predicted, Stop, StopKind, Twist
+from ccatp.kinematics import difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import build_body, course_of_heading, room_m, sensor_depths
 

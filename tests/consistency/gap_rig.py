@@ -19,9 +19,10 @@ import numpy as np
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.wheel_motion import SentDrives, SetPoints
-from ccatp.core import DeckPose, Fix, FloatArray, Twist, difference, wheel_rates
+from ccatp.core import DeckPose, Fix, FloatArray, Twist
 from ccatp.dataloop import MotorRobot, motor_robot
 from ccatp.estimation.fixes import FixGated
+from ccatp.kinematics import difference, wheel_rates
 from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors
 from ccatp.localizer import Localizer, build_with_uncertainty

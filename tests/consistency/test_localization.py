@@ -16,13 +16,14 @@ from ccatp.beacons.slam.beacon_slam import BeaconSlam, recorded_slam
 from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.recording import Reading
 from ccatp.config.models import LocalizerConfig
-from ccatp.core import FloatArray, PanelId, PanelPose, wrap_pi
+from ccatp.core import FloatArray, PanelId, PanelPose
 from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle
 from ccatp.estimation.slip_prior import SlipPrior
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import BA, BG, CT, KG, KL, PL, PR, PSI, SL, SR, STATES, A, C, V, W, X, Y
 from ccatp.filters import FILTERS
 from ccatp.filters.base import Filter
+from ccatp.kinematics import wrap_pi
 from ccatp.mirror.mirror import Mirror
 from tests.support.scenario import transport_rad
 from tests.support.slam_settings import odometry, settings, trust

@@ -20,8 +20,9 @@ import zmq
 
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, PanelId, Twist, twist_of, wheel_rates
+from ccatp.core import DeckPose, PanelId, Twist
 from ccatp.daemon.process import Endpoints
+from ccatp.kinematics import twist_of, wheel_rates
 from ccatp.links.bus import Publisher, Subscriber
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Sensors

@@ -14,10 +14,11 @@ from msgspec.structs import replace
 
 from ccatp.config.models import Config
 from ccatp.control.gate import FanGate, Purpose
-from ccatp.core import Cause, EdgeSample, EventCode, PointId, Stop, Twist, Verdict, WheelSample, twist_of
+from ccatp.core import Cause, EdgeSample, EventCode, PointId, Stop, Twist, Verdict, WheelSample
 from ccatp.daemon.mission_runner import STILL, TimedFrame
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixRefused
+from ccatp.kinematics import twist_of
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import is_estimate_due
 from ccatp.mirror.multilateration import MultilaterationError

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.core import DeckPose, PanelId, PanelPose, Vector3, difference
+from ccatp.core import DeckPose, PanelId, PanelPose, Vector3
+from ccatp.kinematics import difference
 from ccatp.mirror.mirror import Mirror
 from tests.support.scenario import mirror_of
 

@@ -12,10 +12,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ccatp.core import EdgeSample, GravitySample, ImuSample, PanelPose, WheelSample, difference
+from ccatp.core import EdgeSample, GravitySample, ImuSample, PanelPose, WheelSample
 from ccatp.estimation.fixes import FixRefused
 from ccatp.estimation.odometry import arc_step
 from ccatp.estimation.thesis_localizer import FourStateLocalizer
+from ccatp.kinematics import difference
 from tests.faults.linking import Measured
 from tests.unit.estimation.drive import STEEP, Errors, Frame, Robot, build, changed, fix_at, mirror, run, trapeze
 

@@ -17,7 +17,7 @@ from ccatp.beacons.datasets.tables import RadioDataError, tables_of
 from ccatp.beacons.slam.recording import RecordedRun
 from ccatp.config.files import read_input
 from ccatp.config.models import Model
-from ccatp.core import wrap_pi
+from ccatp.kinematics import wrap_pi
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _MOST_TOPICS_BYTES = 100_000

@@ -22,7 +22,8 @@ from ccatp.beacons.conditions import (
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.links.messages import BeaconFrame, decode_beacon_frame
 from ccatp.conditions import ENCODERS_STALE, NO_FRAME, MonitorFinding
-from ccatp.core import EventCode, Permits, Verdict, wrap_pi
+from ccatp.core import EventCode, Permits, Verdict
+from ccatp.kinematics import wrap_pi
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ccatp.beacons.config.models import SimObstacleConfig, SimRadioConfig, SimTargetConfig
 from ccatp.beacons.links.messages import BeaconFrame
-from ccatp.core import bearing, wrap_pi
+from ccatp.kinematics import bearing, wrap_pi
 
 
 class SimDriveCommand(NamedTuple):

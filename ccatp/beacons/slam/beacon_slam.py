@@ -47,7 +47,8 @@ from ccatp.beacons.slam.motion import (
     estimated,
 )
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
-from ccatp.core import FloatArray, wrap_pi
+from ccatp.core import FloatArray
+from ccatp.kinematics import wrap_pi
 
 DELAY = "odometry_delay_s"
 PLACE = 2  # x_m, y_m

@@ -12,7 +12,8 @@ from ccatp.beacons.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
 from ccatp.beacons.slam.measurement_models import MeasurementRow, scalars_of
 from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
-from ccatp.core import FloatArray, wrap_pi
+from ccatp.core import FloatArray
+from ccatp.kinematics import wrap_pi
 
 # From kind, pose, calibration and states of the beacon to a row.
 RowOf = Callable[[str, list[float], list[float], list[float]], MeasurementRow]

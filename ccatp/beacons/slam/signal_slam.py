@@ -16,7 +16,8 @@ from ccatp.beacons.slam.measurement_models import BearingModel, LevelModel, Meas
 from ccatp.beacons.slam.motion import POSE, Odometry, SlippingVehicle, VehiclePose
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
-from ccatp.core import FloatArray, wrap_pi
+from ccatp.core import FloatArray
+from ccatp.kinematics import wrap_pi
 
 _ITERATIONS = 4
 _NEAREST_M = 0.02  # smallest distance, so that derivatives of the distance exist

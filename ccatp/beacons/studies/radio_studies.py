@@ -33,8 +33,9 @@ from ccatp.beacons.slam.recording import Reading
 from ccatp.beacons.slam.signal_slam import ReflectorScan
 from ccatp.beacons.steering import HALT
 from ccatp.beacons.studies.radio_bound import RadioBound, TrueStep, radio_bound
-from ccatp.core import FloatArray, wrap_pi
+from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion, rms, rms_m, wrapped
+from ccatp.kinematics import wrap_pi
 from ccatp.missions import Part
 from ccatp.report.plots import INK
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.config.models import MissionConfig, RobotConfig
-from ccatp.core import DeckPose, FloatArray, PanelId, bearing, difference
+from ccatp.core import DeckPose, FloatArray, PanelId
 from ccatp.errors import CcatpError, ExitStatus
+from ccatp.kinematics import bearing, difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.rim import Rim, to_segment_m
 

@@ -8,7 +8,8 @@ from math import ceil, hypot
 import numpy as np
 
 from ccatp.config.models import Config, LimitsConfig
-from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind, difference
+from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
+from ccatp.kinematics import difference
 from ccatp.mirror.layout import POINTS_PER_ROW
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.escape import find_escape, find_retreats, plan_calibration

@@ -6,7 +6,8 @@ from itertools import pairwise
 from math import dist, hypot, pi, sqrt
 
 from ccatp.config.models import LimitsConfig
-from ccatp.core import DeckPose, Stop, bearing, difference
+from ccatp.core import DeckPose, Stop
+from ccatp.kinematics import bearing, difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import LegPlace, LegRules, heading_of_course
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from ccatp.config.models import Config, PidConfig, RobotConfig
 from ccatp.control.tracker import Pid, PidState, Profile, ProfiledAxis, lag_feed_forward
 from ccatp.control.wheel_motion import SentDrives
-from ccatp.core import Predicted, Twist, wheel_rates
+from ccatp.core import Predicted, Twist
+from ccatp.kinematics import wheel_rates
 
 
 def gains(kp: float, ki: float, kd: float, integral_limit: float = 10.0, filter_s: float = 0.0) -> PidConfig:

@@ -13,7 +13,8 @@ from ccatp.config.models import Config
 from ccatp.control.gate import DriveGate, Purpose
 from ccatp.control.tracker import LegLine, LegMotion, LegPhase, LegTracker, LegView, line_rate
 from ccatp.control.wheel_motion import SentDrives
-from ccatp.core import Twist, Verdict, difference, twist_of, wheel_rates
+from ccatp.core import Twist, Verdict
+from ccatp.kinematics import difference, twist_of, wheel_rates
 from ccatp.survey.planning.search import bang_bang_time
 
 DT = 0.01

@@ -25,11 +25,11 @@ from ccatp.core import (
     PanelPose,
     Vector3,
     WheelSample,
-    difference,
 )
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import FilterWrap, unwrapped
 from ccatp.filters.base import Filter, FilterDiverged
+from ccatp.kinematics import difference
 from ccatp.localizer import Localizer, build_localizer
 from tests.support.scenario import config_of, mirror_of
 

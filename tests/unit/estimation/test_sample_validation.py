@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import FullStateConfig
-from ccatp.core import DeckPose, GravitySample, ImuSample, PanelPose, WheelSample, difference, wrap_pi
+from ccatp.core import DeckPose, GravitySample, ImuSample, PanelPose, WheelSample
 from ccatp.estimation.localizer_base import SampleValidator
 from ccatp.estimation.odometry import Terrain
 from ccatp.estimation.rest import NoiseFloor, ZeroVelocityDetector, heading_from_gravity
 from ccatp.estimation.state_model import BA, BG, PSI, W
+from ccatp.kinematics import difference, wrap_pi
 from ccatp.mirror.mirror import Mirror
 from tests.unit.estimation.drive import FRAME_S, STEEP, Errors, Frame, Robot, build, run, trapeze
 

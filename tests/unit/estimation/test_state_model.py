@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccatp.core import DeckPose, FloatArray, PanelId, difference
+from ccatp.core import DeckPose, FloatArray, PanelId
 from ccatp.estimation.odometry import Slope, Terrain, axes_on
 from ccatp.estimation.state_model import CT, KL, PL, PR, PSI, SL, SR, STATES, A, C, SensorRows, SurveyMotion, V, W, X, Y
+from ccatp.kinematics import difference
 from ccatp.mirror.mirror import Mirror
 from tests.unit.estimation.drive import STEEP, Errors, Robot, build, config
 

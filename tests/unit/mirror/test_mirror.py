@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import PanelsConfig
-from ccatp.core import DeckPose, PanelId, PanelPose, PointId, bearing, difference
+from ccatp.core import DeckPose, PanelId, PanelPose, PointId
+from ccatp.kinematics import bearing, difference
 from ccatp.mirror.layout import PanelGrid
 from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world

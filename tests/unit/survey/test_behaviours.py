@@ -12,7 +12,8 @@ from ccatp.conditions import BEYOND_SEAM, NO_SEAM, RIM_AHEAD, Condition
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker
-from ccatp.core import Cause, DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Verdict, difference
+from ccatp.core import Cause, DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Verdict
+from ccatp.kinematics import difference
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.studies.sil_run import SilRun

@@ -19,7 +19,7 @@ from ccatp.beacons.sim.radio import (
     seen_m,
 )
 from ccatp.beacons.sim.radio_world import RadioWorld
-from ccatp.core import wrap_pi
+from ccatp.kinematics import wrap_pi
 from tests.support.scenario import radio_config_of
 
 BALL = SimObstacleConfig(x_m=1.0, y_m=0.0, radius_m=0.2)

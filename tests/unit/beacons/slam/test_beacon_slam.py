@@ -28,8 +28,9 @@ from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import BeaconId, EstimatedPath, Reading, RecordedRun, Steps
 from ccatp.beacons.slam.track_review import range_residuals
-from ccatp.core import FloatArray, wrap_pi
+from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, best_motion
+from ccatp.kinematics import wrap_pi
 from tests.support.slam_settings import Settings, odometry, settings, trust
 from tests.unit.beacons.datasets.sets import recorded, world
 

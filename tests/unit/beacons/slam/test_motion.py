@@ -15,7 +15,8 @@ from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun
 from ccatp.beacons.slam.signal_slam import ReflectorScan
-from ccatp.core import FloatArray, wrap_pi
+from ccatp.core import FloatArray
+from ccatp.kinematics import wrap_pi
 from tests.support.slam_settings import odometry, settings
 from tests.unit.beacons.datasets.sets import recorded, world
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import LimitsConfig
-from ccatp.core import DeckPose, PointId, Stop, StopKind, bearing, difference
+from ccatp.core import DeckPose, PointId, Stop, StopKind
+from ccatp.kinematics import bearing, difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.escape import find_retreats
 from ccatp.survey.planning.legs import (
