@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ccatp.conditions import UNATTENDED_FAULT, text_of
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
-from ccatp.control.wheel_motion import SentDrives, as_standing
+from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import NO_CAUSE, Cause, Verdict
 from ccatp.daemon.checkpoints import build_parts
 from ccatp.daemon.fix_service import FixRequest, FixService
@@ -34,6 +34,7 @@ from ccatp.links.topics import (
 from ccatp.localizer import Localizer
 from ccatp.records.checkpoint import FILE, CheckpointFile
 from ccatp.records.store import MissionStore
+from ccatp.sensing.wheel_means import as_standing
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer

@@ -11,13 +11,14 @@ import numpy as np
 
 from ccatp.conditions import FILTER_DIVERGED, FRAMES_BACKWARD, SENSOR_BACKWARD
 from ccatp.config.models import Config
-from ccatp.control.wheel_motion import ImuGate, WheelMeans, largest_rate_rad_s
 from ccatp.core import NO_CAUSE, Cause, EdgeSample, Fix, GravitySample, ImuSample, WheelSample
 from ccatp.estimation.fixes import DeckFoot, check_fix, deck_foot
 from ccatp.estimation.wheel_coast import CoastedMotion, WheelCoast, WheelInput
 from ccatp.filters import FILTERS
 from ccatp.filters.base import Filter, FilterDiverged
 from ccatp.mirror.mirror import Mirror
+from ccatp.sensing.imu_gate import ImuGate
+from ccatp.sensing.wheel_means import WheelMeans, largest_rate_rad_s
 
 ImuReadings = Sequence[ImuSample]
 Edges = Sequence[EdgeSample]

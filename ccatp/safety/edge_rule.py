@@ -25,12 +25,12 @@ from collections.abc import Sequence
 from math import cos, hypot, inf, sin
 
 from ccatp.config.models import DangerConfig, RobotConfig
-from ccatp.control.wheel_motion import largest_rate_rad_s
 from ccatp.core import EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim
 from ccatp.safety.edge_detector import EdgeDetector, EdgeLimits, EdgeMap, EdgePhase
 from ccatp.safety.wheel_odometry import Odometry, WheelTrack, pose_at
+from ccatp.sensing.wheel_means import largest_rate_rad_s
 
 SENSORS = 4
 # Below this speed the robot stands. At rest only a fix can reduce the estimate's sigma to less than half.

@@ -7,12 +7,12 @@ from math import inf
 from ccatp import conditions
 from ccatp.conditions import SAMPLE_RATES, MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.control.wheel_motion import ImuGate, MotionSum, WheelMeans
 from ccatp.core import EdgeSample, ImuSample, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import FindingLatch
+from ccatp.safety.motion_sums import MotionSum
 from ccatp.safety.sensor_monitors import (
     FANS,
     REPORTED,
@@ -25,7 +25,9 @@ from ccatp.safety.sensor_monitors import (
 )
 from ccatp.safety.speed_ratio import SpeedRatioMonitor
 from ccatp.safety.wheel_monitors import LATE_S, GripMonitor, WheelMonitor
+from ccatp.sensing.imu_gate import ImuGate
 from ccatp.sensing.sample_times import LATEST_S, OLDEST_S, worst_offset_s
+from ccatp.sensing.wheel_means import WheelMeans
 
 _STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s
 _LOOK_FRAMES = 2  # while nothing is wrong, the monitors judge every second frame; the sums take all frames

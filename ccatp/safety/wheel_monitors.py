@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.control.wheel_motion import MotionSum, SlidingWindow, WheelMeans
 from ccatp.core import GravitySample, ImuSample, WheelSample
 from ccatp.safety.escalation import FindingLatch, Since
+from ccatp.safety.motion_sums import MotionSum, SlidingWindow
+from ccatp.sensing.wheel_means import WheelMeans
 from ccatp.slide_rule import SlideRule
 
 # After this time a command has less than 2 % effect on a wheel (servo 0.1 s, link 40 ms).

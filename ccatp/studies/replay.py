@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ccatp.config.models import Config
-from ccatp.control.wheel_motion import as_standing
 from ccatp.core import DeckPose, FloatArray, IntArray
 from ccatp.estimation.fixes import FixRefused
 from ccatp.estimation.wheel_coast import CoastedMotion
@@ -24,6 +23,7 @@ from ccatp.records.run_reader import Event, Fixed, Marked, Trace, TraceBuilder
 from ccatp.records.summary import distribution
 from ccatp.records.timeline import common_rows, rows_of
 from ccatp.report.html import render
+from ccatp.sensing.wheel_means import as_standing
 from ccatp.studies.results import value_at
 from ccatp.studies.smoother import ROUNDING, Smoothed, Smoother
 

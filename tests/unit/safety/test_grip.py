@@ -17,13 +17,13 @@ from ccatp.conditions import (
 )
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.control.wheel_motion import WheelMeans
 from ccatp.core import GravitySample, ImuSample, Severity, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import motor_robot
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import SeverityEscalation
 from ccatp.safety.wheel_monitors import GripMonitor
+from ccatp.sensing.wheel_means import WheelMeans
 from ccatp.slide_rule import SlideRule
 
 DT_S = 0.01
