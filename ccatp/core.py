@@ -1,4 +1,4 @@
-"""Value types shared by all packages (samples, poses, fixes, verdicts), angles, kinematics, steady robot time."""
+"""Value types shared by all packages: samples, poses, fixes, causes, verdicts, stops."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Motion of the wheels: prediction from the sent drives, means of the encoder samples, plausibility of the IMU."""
+"""Motion of the wheels, predicted from the sent drives."""
 
 from collections import deque
 from math import cos, exp, sin, sqrt
