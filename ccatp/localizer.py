@@ -1,15 +1,11 @@
 """Builds the localizer of a configuration."""
 
-from ccatp.config.models import Config
+from ccatp.config.models import FOUR_STATE, Config
 from ccatp.core import DeckPose, PanelPose
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import FilterWrap, unwrapped
 from ccatp.estimation.thesis_localizer import FourStateLocalizer
 from ccatp.mirror.mirror import Mirror
-
-FOUR_STATE = ("kf",)
-"""Filters for linear models, which use the thesis's four states; all others use the full state."""
-
 
 Localizer = FourStateLocalizer | FullStateLocalizer
 """Estimates the robot's pose from sensors frames and fixes (thesis chapter 2)."""

@@ -51,6 +51,7 @@ class MissionKind:
     # The run: texts, what is checked before it begins, processes, summary.
     text: Part = Part("ccatp.daemon.run_text:plain_text")  # Callable[[C], daemon.run_text.RunText]
     check: Part | None = None  # Callable[[daemon.run_dir.RunOptions, C], None], raises ConfigError
+    without_effect: Part | None = None  # Callable[[C], list[str]]: a line for each key that was set and does nothing
     resumed: Part | None = None  # Callable[[C, Path], None], raises ConfigError: the run in a folder is another one
     processes: Part = Part("ccatp.daemon.supervisor:WITHOUT_LASER")  # tuple[daemon.child_processes.ProcessSpec, ...]
     record: Part = Part("ccatp.records.run_record:status_record")  # Callable[[C, Path, RobotClock, bool], RunRecord]

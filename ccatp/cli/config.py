@@ -40,7 +40,10 @@ def config_check(file: Path) -> int:
         for problem in error.problems:
             common.complain(problem, error.exit_status)
         return error.exit_status
-    text = kind_of(cfg).text.get()(cfg)
+    kind = kind_of(cfg)
+    text = kind.text.get()(cfg)
+    if kind.without_effect is not None:
+        common.warn(f"{file}: {line}" for line in kind.without_effect.get()(cfg))
     click.echo(f"{file}: ok: {text.shown}, seed {cfg.run.seed}")
     return 0
 

@@ -9,8 +9,9 @@ from typing import Any
 
 from ccatp.config.files import read_toml
 from ccatp.config.load import DEFAULT_FILE, available, load_config, load_mission
+from ccatp.config.messages import format_value
 from ccatp.config.mission import MissionConfig
-from ccatp.config.models import Config
+from ccatp.config.models import FOUR_STATE, Config
 from ccatp.config.package import configs_dir
 from ccatp.missions import kind_of
 
@@ -98,6 +99,19 @@ def differences(cfg: MissionConfig, other: MissionConfig | None = None) -> list[
     before, after = dict(_leaves(other.model_dump(mode="json"))), dict(_leaves(cfg.model_dump(mode="json")))
     keys = dict.fromkeys((*before, *after))
     return [(key, before.get(key), after.get(key)) for key in keys if before.get(key) != after.get(key)]
+
+
+def keys_without_effect(cfg: Config) -> list[str]:
+    """A line for each key of a survey that differs from the default and is for another filter than ``run.filter``."""
+    unused, filters = ("full_state", "ekf and ukf") if cfg.run.filter in FOUR_STATE else ("four_state", "kf")
+    shipped = load_config().localizer.model_dump(mode="json")[unused]
+    own = cfg.localizer.model_dump(mode="json")[unused]
+    changed = dict(_leaves(own)).items() - dict(_leaves(shipped)).items()
+    return [
+        f"localizer.{unused}.{key} = {format_value(value)} has no effect with run.filter = {cfg.run.filter}; it is for "
+        f"{filters}"
+        for key, value in sorted(changed)
+    ]
 
 
 def _leaves(tree: Mapping[str, Any], at: str = "") -> Iterator[tuple[str, object]]:

@@ -4,7 +4,7 @@ import difflib
 import json
 import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -48,6 +48,14 @@ _RUN_MARKS = ("origin.json", "mission.sqlite")
 _SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
     "mirror": ("mirrors", MirrorConfig),
     "world": ("worlds", WorldConfig),
+}
+# Keys of surveys that have another place now: files and recordings of before are read as they were meant.
+_MOVED = {
+    ("localizer", name): ("localizer", "four_state", name)
+    for name in (
+        *("jerk_density_m2_s5", "angular_acceleration_density_rad2_s3", "slip_fraction"),
+        *("crossing_time_sigma_s", "crossing_max_rate_rad_s", "crossing_min_speed_m_s", "crossing_gate_sigma"),
+    )
 }
 _MOST_PROBLEMS = 10  # that one error lists
 # In comments: a stand-in value, and what takes its place.
@@ -167,6 +175,15 @@ def _place(sources: list[ConfigSource], *keys: Key) -> str:
     return source.place(key)
 
 
+def _with_moved_keys(tree: Tree) -> Tree:
+    """A tree with the keys of older versions at their present places; where both are given, the present one counts."""
+    for old, new in _MOVED.items():
+        section = _value(tree, *old[:-1])
+        if isinstance(section, dict) and old[-1] in section:
+            tree = merged(nested({".".join(new): section.pop(old[-1])}), tree)
+    return tree
+
+
 def _value(tree: object, *key: str) -> Any:
     """Value of a key; ``None`` if there is none."""
     for part in key:
@@ -203,7 +220,8 @@ def load_config(file: Path | None = None, overrides: Overrides = None, *, any_po
     ``any_ports``: the simulated servers take any free port unless file or overrides name one. ConfigError: one line
     with file, line, key, what is wrong and what to do; NotASurvey: the file is of another kind of mission.
     """
-    command, user, base = sources = layers(DEFAULT_FILE, file, overrides, any_ports=any_ports)
+    given = layers(DEFAULT_FILE, file, overrides, any_ports=any_ports)
+    command, user, base = sources = [replace(source, tree=_with_moved_keys(source.tree)) for source in given]
     system = user.tree.pop("system", SURVEY)
     if file is not None and system != SURVEY:
         kind = find_kind(system)

@@ -44,6 +44,10 @@ class ProcessesConfig(Model):
     restart_window_s: Positive
 
 
+FOUR_STATE = ("kf",)
+"""Values of ``run.filter`` for linear models, which use the thesis's four states; all others use the full state."""
+
+
 class RunConfig(ProcessesConfig):
     """What to survey and how."""
 
@@ -207,6 +211,18 @@ class FullStateConfig(Model):
     use: TechniquesConfig
 
 
+class FourStateConfig(Model):
+    """Noise of the thesis's four-state filter, and its use of crossed seams; without effect with other filters."""
+
+    jerk_density_m2_s5: Positive
+    angular_acceleration_density_rad2_s3: Positive
+    slip_fraction: NonNegative
+    crossing_time_sigma_s: Positive
+    crossing_max_rate_rad_s: Positive
+    crossing_min_speed_m_s: Positive
+    crossing_gate_sigma: Positive
+
+
 class LocalizerConfig(Model):
     """Noise model of the localizer; standard deviations."""
 
@@ -214,19 +230,13 @@ class LocalizerConfig(Model):
     gyroscope_sigma_rad_s: Positive
     gyroscope_bias_rad_s: Annotated[float, Field(ge=-1.0, le=1.0)]
     encoder_sigma_rad_s: Positive
-    jerk_density_m2_s5: Positive
-    angular_acceleration_density_rad2_s3: Positive
     start_position_sigma_m: Positive
     start_heading_sigma_rad: Positive
     reset_speed_sigma_m_s: Positive
     reset_acceleration_sigma_m_s2: Positive
     reset_rate_sigma_rad_s: Positive
-    slip_fraction: NonNegative
-    crossing_time_sigma_s: Positive
-    crossing_max_rate_rad_s: Positive
-    crossing_min_speed_m_s: Positive
-    crossing_gate_sigma: Positive
     history_s: Positive
+    four_state: FourStateConfig
     full_state: FullStateConfig
 
 

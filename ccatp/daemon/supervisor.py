@@ -170,6 +170,8 @@ class SupervisedRun:
         kind = kind_of(cfg)
         text: RunText = kind.text.get()(cfg)
         self._log.info("run_started", **{kind.subject: text.subject}, seed=cfg.run.seed, sim=is_sim)
+        for line in () if kind.without_effect is None else kind.without_effect.get()(cfg):
+            self._notify_operator("warning", line)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag instead of an exception, so that no exception handler loses a signal, and no signal ends the shutdown.
         previous = {n: signal.signal(n, self._interrupt) for n in STOP_SIGNALS}

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.config.models import LocalizerConfig, RobotConfig
+from ccatp.config.models import FourStateConfig, RobotConfig
 from ccatp.core import DeckPose, EdgeSample, FloatArray, PanelId, PanelPose
 from ccatp.estimation.localizer_base import EdgeScanner, SensorTransition
 from ccatp.estimation.odometry import Odometer, OdometryPose, Slope, axes_on
@@ -76,7 +76,7 @@ class CrossingDetector:
     the same seam in the same sense, with almost pure translation in between.
     """
 
-    def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig) -> None:
+    def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: FourStateConfig) -> None:
         self._mirror = mirror
         self._sensors = robot.edge_sensors_m
         self._cfg = cfg

@@ -100,7 +100,8 @@ class ConstantAcceleration:
     """
 
     def __init__(self, cfg: LocalizerConfig) -> None:
-        self._jerk, self._alpha = cfg.jerk_density_m2_s5, cfg.angular_acceleration_density_rad2_s3
+        four = cfg.four_state
+        self._jerk, self._alpha = four.jerk_density_m2_s5, four.angular_acceleration_density_rad2_s3
         self._F, self._Q = np.eye(STATES), np.zeros((STATES, STATES))
 
     def over(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
@@ -177,9 +178,9 @@ class FourStateLocalizer(LocalizerBase):
         self._process = ConstantAcceleration(cfg)
         self._builder = MeasurementBuilder(config.robot, cfg)
         self._odometer = Odometer(cfg.history_s)
-        self._crossings = CrossingDetector(mirror, config.robot, cfg)
-        self._gate = HeadingGate(cfg.crossing_gate_sigma)
-        self._sigma = PositionSigma(cfg.start_position_sigma_m, cfg.slip_fraction)
+        self._crossings = CrossingDetector(mirror, config.robot, cfg.four_state)
+        self._gate = HeadingGate(cfg.four_state.crossing_gate_sigma)
+        self._sigma = PositionSigma(cfg.start_position_sigma_m, cfg.four_state.slip_fraction)
         self._deck: DeckPose | None = None
         self._radius_m, self._base_m = config.robot.wheel_radius_m, config.robot.wheel_base_m
         self._wheels_s, self._pause_s = -inf, inf  # last frame with samples of both wheels, shortest time between two

@@ -101,7 +101,8 @@ def thesis_problem(cfg: Config, rows: int) -> FilterProblem:
     sigma[2 * k :] = noise.accelerometer_sigma_m_s2, noise.gyroscope_sigma_rad_s
     F = np.eye(4)
     F[0, 1] = F[2, 3] = DT_S
-    impulse = np.array([0.0, noise.jerk_density_m2_s5, 0.0, noise.angular_acceleration_density_rad2_s3]) * DT_S
+    four = noise.four_state
+    impulse = np.array([0.0, four.jerk_density_m2_s5, 0.0, four.angular_acceleration_density_rad2_s3]) * DT_S
     mean, covariance = np.array([0.05, 0.0, 0.2, 0.1]), np.diag([1e-4, 1e-2, 1e-4, 1e-2])
     return linear_problem(mean, covariance, F, H, F @ np.diag(impulse) @ F.T, MILDER * sigma**2)
 

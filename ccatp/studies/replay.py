@@ -10,13 +10,13 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ccatp.config.models import Config
+from ccatp.config.models import FOUR_STATE, Config
 from ccatp.core import DeckPose, FloatArray, IntArray
 from ccatp.estimation.fixes import FixRefused
 from ccatp.estimation.wheel_coast import CoastedMotion
 from ccatp.filters.base import Filter, FilterError, FilterModel, Innovation
 from ccatp.filters.metrics import nees, rms
-from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
+from ccatp.localizer import Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
 from ccatp.records.run_reader import Event, Fixed, Marked, Trace, TraceBuilder

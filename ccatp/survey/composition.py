@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from ccatp.config.models import Config, LimitsConfig
+from ccatp.config.models import FOUR_STATE, Config, LimitsConfig
 from ccatp.control.gate import DriveGate
 from ccatp.control.thrust import GripForecast, ThrustControl, forecast_grip
 from ccatp.core import DeckPose, PointId, Stop, StopKind
@@ -17,7 +17,7 @@ from ccatp.errors import ConfigError
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.state_model import CT
 from ccatp.links.robot_messages import Hello
-from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
+from ccatp.localizer import Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.survey.events import HELD, IDLE, MEASURING, SETTLING, MissionState, TakenOver
 from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner

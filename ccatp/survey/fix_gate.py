@@ -13,10 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.conditions import FRAME_REFUSED, LENGTHS_REFUSED
-from ccatp.config.models import Config, EtalonConfig
+from ccatp.config.models import FOUR_STATE, Config, EtalonConfig
 from ccatp.core import NO_CAUSE, Cause, DeckPose, Fix, FloatArray, PointId, Vector3
 from ccatp.estimation.fixes import DeckFoot, FixRefused, deck_foot
-from ccatp.localizer import FOUR_STATE
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 

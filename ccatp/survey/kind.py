@@ -12,6 +12,7 @@ SURVEY = MissionKind(
     shipped=Part("ccatp.config.describe:shipped_config"),
     text=Part("ccatp.daemon.survey_run:survey_text"),
     check=Part("ccatp.daemon.survey_run:check_survey"),
+    without_effect=Part("ccatp.config.describe:keys_without_effect"),
     resumed=Part("ccatp.daemon.survey_run:check_resumed"),
     processes=Part("ccatp.daemon.supervisor:PROCESSES"),
     record=Part("ccatp.daemon.survey_record:SurveyRecord"),

@@ -280,6 +280,29 @@ def test_the_laser_system_alone_gets_its_puck(stub: Stub, tmp_path: Path) -> Non
     assert of_robot == [None, f"ipc://{tmp_path}/puck"]
 
 
+@pytest.mark.parametrize(
+    ("text", "lines"),
+    [
+        ("[localizer.four_state]\nslip_fraction = 0.1\n",
+         ["localizer.four_state.slip_fraction = 0.1 has no effect with run.filter = ekf; it is for kf"]),
+        ("[localizer]\nslip_fraction = 0.1\n",  # where it was in older versions
+         ["localizer.four_state.slip_fraction = 0.1 has no effect with run.filter = ekf; it is for kf"]),
+        ('[run]\nfilter = "kf"\n[localizer.four_state]\nslip_fraction = 0.1\n', []),
+        ('[run]\nfilter = "kf"\n[localizer.full_state]\nslip_mean = 0.1\n[localizer.full_state.use]\nseams = false\n',
+         ["localizer.full_state.slip_mean = 0.1 has no effect with run.filter = kf; it is for ekf and ukf",
+          "localizer.full_state.use.seams = false has no effect with run.filter = kf; it is for ekf and ukf"]),
+        ("[localizer]\nhistory_s = 0.3\n", []),
+    ],
+)  # fmt: skip
+def test_keys_for_another_filter_are_reported(
+    text: str, lines: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "telescope.toml"
+    file.write_text(text)
+    assert main(["config", "check", str(file)]) == 0
+    assert capsys.readouterr().err.splitlines() == [f"ccatp: warning: {file}: {line}" for line in lines]
+
+
 def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "mine.toml"
     file.write_text("[run]\nseed = 3\n")

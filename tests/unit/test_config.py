@@ -556,3 +556,19 @@ def test_the_check_of_a_configuration_reports_each_missing_file_of_mirror_and_wo
     assert len(lines) == 2
     assert "none.toml" in lines[0]
     assert "nowhere.toml" in lines[1]
+
+
+# -- keys of older versions ------------------------------------------------------------------------------------------
+
+
+def test_keys_that_have_moved_mean_what_they_meant(tmp_path: Path) -> None:
+    """Files of users, recordings and run directories hold them at their old place."""
+    file = tmp_path / "telescope.toml"
+    file.write_text("[localizer]\nslip_fraction = 0.1\ncrossing_gate_sigma = 4.0\n")
+    found = load_config(file).localizer.four_state
+    assert (found.slip_fraction, found.crossing_gate_sigma) == (0.1, 4.0)
+    assert load_config(file, {"localizer.four_state.slip_fraction": 0.2}).localizer.four_state.slip_fraction == 0.2
+    assert load_config(None, {"localizer.slip_fraction": 0.3}).localizer.four_state.slip_fraction == 0.3
+    file.write_text("[localizer]\nslip_fraction = -1.0\n")
+    with pytest.raises(ConfigError, match=r"telescope\.toml:1: localizer\.four_state\.slip_fraction = -1\.0 must be"):
+        load_config(file)

@@ -215,8 +215,14 @@ def test_the_table_and_the_csv(run_dir: Path, tmp_path: Path, capsys: pytest.Cap
     ("argv", "message"),
     [
         (["--filter", "efk"], "run.filter = \"efk\" must be 'kf', 'ekf' or 'ukf'; did you mean ekf?"),
-        (["--set", "localizer.slip_fractoin=1"], "is unknown; did you mean localizer.slip_fraction?"),
-        (["--set", "localizer.slip_fraction=-1"], "localizer.slip_fraction = -1 must be greater than or equal to 0"),
+        (
+            ["--set", "localizer.four_state.slip_fractoin=1"],
+            "is unknown; did you mean localizer.four_state.slip_fraction?",
+        ),
+        (
+            ["--set", "localizer.four_state.slip_fraction=-1"],
+            "localizer.four_state.slip_fraction = -1 must be greater than or equal to 0",
+        ),
         (["--set", "control.gains=thesis"], "control.gains: has no effect on a replay"),
         (["--smooth"], "--smooth: the pose is no state of filter kf; choose --filter ekf or ukf"),
         (["--out", "/nowhere/o.csv"], "--out: no directory /nowhere; make it first"),

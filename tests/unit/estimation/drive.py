@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.config.models import Config
+from ccatp.config.models import FOUR_STATE, Config
 from ccatp.core import (
     DeckPose,
     EdgeSample,
@@ -68,11 +68,14 @@ def build(
 
 def changed(name: str = "ekf", use: dict[str, bool] | None = None, **changes: float) -> Config:
     cfg = config().localizer
-    full = cfg.full_state
-    of_full = {key: value for key, value in changes.items() if hasattr(full, key)}
-    of_both = {key: value for key, value in changes.items() if hasattr(cfg, key) and key not in of_full}
-    full = full.model_copy(update={"use": full.use.model_copy(update=use or {}), **of_full})
-    cfg = cfg.model_copy(update={"full_state": full, **of_both})
+    full, four = cfg.full_state, cfg.four_state
+    own = four if name in FOUR_STATE else full  # both have densities
+    of_own = {key: value for key, value in changes.items() if hasattr(own, key)}
+    of_both = {key: value for key, value in changes.items() if hasattr(cfg, key) and key not in of_own}
+    assert changes.keys() == of_own.keys() | of_both.keys()
+    full = full.model_copy(update={"use": full.use.model_copy(update=use or {}), **(of_own if own is full else {})})
+    four = four.model_copy(update=of_own if own is four else {})
+    cfg = cfg.model_copy(update={"full_state": full, "four_state": four, **of_both})
     run = config().run.model_copy(update={"filter": name})
     return config().model_copy(update={"localizer": cfg, "run": run})
 
