@@ -11,8 +11,8 @@ from scipy.sparse import coo_array, csr_array, diags_array, hstack
 from scipy.sparse.linalg import splu
 
 from ccatp.beacons.cricket.range_network import IndexArray, RangeNetwork, coordinates_of
+from ccatp.beacons.rigid_motion import rigid_modes
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import rigid_modes
 
 
 class MapState(NamedTuple):

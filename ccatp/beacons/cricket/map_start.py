@@ -9,8 +9,8 @@ from scipy.sparse.csgraph import shortest_path
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.range_network import PairMeans, RangeNetwork, adjacency, every_pair
 from ccatp.beacons.cricket.trilateration import sphere_crossings
+from ccatp.beacons.rigid_motion import best_motion
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import best_motion
 
 _SPARE = 2  # extra dimensions, in which a folded part of the map can turn over
 # Successive weights of the spare dimensions, in units of the median weight of a distance.

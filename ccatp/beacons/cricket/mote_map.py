@@ -21,8 +21,8 @@ from ccatp.beacons.cricket.map_fit import (
 from ccatp.beacons.cricket.map_start import filled, grown, images, unfolded, with_bodies
 from ccatp.beacons.cricket.range_network import RangeNetwork, graph_pairs, sides
 from ccatp.beacons.cricket.trilateration import trilaterate
+from ccatp.beacons.rigid_motion import RigidMotion, best_motion, rigid_modes
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import RigidMotion, best_motion, rigid_modes
 
 _SURE = 2.0  # below this cost per degree of freedom a map has no fold and needs no other start
 _SAME = 1e-6  # relative difference of costs up to which two fits are the same minimum

@@ -11,9 +11,9 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ccatp.beacons.config.models import CricketConfig
+from ccatp.beacons.rigid_motion import RigidMotion, best_motion
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.filters.metrics import RigidMotion, best_motion
 
 ABSOLUTE_ZERO_C = -273.15
 COLDEST_C, HOTTEST_C = -60.0, 80.0  # beyond, a thermometer is broken

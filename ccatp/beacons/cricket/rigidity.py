@@ -18,8 +18,8 @@ from ccatp.beacons.cricket.range_network import (
     list_names,
     sides,
 )
+from ccatp.beacons.rigid_motion import rigid_modes
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import rigid_modes
 
 _NULL = 1e-10  # of the largest eigenvalue; below it no range determines the direction
 _STILL = 1e-6  # of the fastest speed; below it a mote does not move

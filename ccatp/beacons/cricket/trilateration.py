@@ -9,8 +9,8 @@ import numpy as np
 from ccatp.beacons.cricket.map_fit import robust_loss
 from ccatp.beacons.cricket.mote_plan import MotePlan
 from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, RigidBody, list_names
+from ccatp.beacons.rigid_motion import RigidMotion
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import RigidMotion
 
 _APART = 10.0  # distance in sigmas above which two solutions are different
 _ALIKE = 9.0  # difference of chi-squared below which the mirror image may be the true position

@@ -19,8 +19,9 @@ from ccatp.beacons.links.messages import (
     pose_truth,
     table,
 )
+from ccatp.beacons.rigid_motion import aligned_rms_m, rms_m
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import aligned_rms_m, nees, rms_m
+from ccatp.filters.metrics import nees
 from ccatp.links import topics
 from ccatp.records.recorder import RobotClock
 from ccatp.records.run_record import RunRecord

@@ -14,6 +14,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, c
 
 from ccatp.beacons.config.models import FixedLagConfig, RadioNoiseConfig, RecordingConfig, SlamFilterConfig
 from ccatp.beacons.filters.ekf_slam import columns_of
+from ccatp.beacons.rigid_motion import best_motion
 from ccatp.beacons.slam.batch_problem import BEACON, RSSI_REFERENCE, SHARED, ArrowSystem, BatchProblem, BatchState
 from ccatp.beacons.slam.beacon_slam import BeaconSlam
 from ccatp.beacons.slam.causal import beyond_priors, follow
@@ -22,7 +23,6 @@ from ccatp.beacons.slam.landmark_init import LEAST
 from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun, Steps
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import best_motion
 
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e9

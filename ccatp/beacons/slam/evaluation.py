@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.rigid_motion import RigidMotion, best_motion
 from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, ReferencePath
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import Consistency, RigidMotion, best_motion, consistency, nees, rms, wrapped
+from ccatp.filters.metrics import Consistency, consistency, nees, rms, wrapped
 
 LONGEST_GAP_S = 0.5  # the truth is interpolated over gaps up to this length,
 USUAL_GAPS = 3.0  # or up to this many of its median intervals

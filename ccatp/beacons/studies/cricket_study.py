@@ -16,10 +16,10 @@ from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m
 from ccatp.beacons.cricket.mote_map import map_motes
 from ccatp.beacons.cricket.range_network import MoteRange, RangeNetwork, build_network, components
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
+from ccatp.beacons.rigid_motion import best_motion
 from ccatp.beacons.studies.mote_runs import look_ahead, percentiles, run_batch, run_filter, simulate_field
 from ccatp.config.models import Config
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import best_motion
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.results import LIMIT, Measure, Row, band, colour, draw_ranges, plot, write_analysis
 

@@ -24,9 +24,9 @@ from ccatp.beacons.cricket.rigidity import FoldOver, Freedom, find_fold_over, fi
 from ccatp.beacons.cricket.self_mapping import begin_phase_two, complete_stands, run_phase_two
 from ccatp.beacons.cricket.trilateration import FirstMap, map_by_plan
 from ccatp.beacons.report.plots import MapPicture, Traces
+from ccatp.beacons.rigid_motion import RigidMotion, aligned_rms_m, best_motion, rms_m
 from ccatp.beacons.sim.motes import MoteField, MotePulse, true_motes
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import RigidMotion, aligned_rms_m, best_motion, rms_m
 
 _LAYOUT, _FIELD, _READINGS = 0, 1, 2  # streams of random numbers of one seed
 _GENERIC = 0  # seed of the random positions for rank and fold-over, which must not depend on the run

@@ -26,6 +26,7 @@ from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.links.messages import RadioScan
 from ccatp.beacons.navigation import BeaconMeasurements, RadioNavigator, odometry_of, packets_of
 from ccatp.beacons.pilot import BeaconPilot
+from ccatp.beacons.rigid_motion import best_motion, rms_m
 from ccatp.beacons.sim.radio import SimDriveCommand, TruePose, TrueRadio
 from ccatp.beacons.sim.radio_world import RadioWorld
 from ccatp.beacons.slam.path_loss import PathLoss
@@ -34,7 +35,7 @@ from ccatp.beacons.slam.signal_slam import ReflectorScan
 from ccatp.beacons.steering import HALT
 from ccatp.beacons.studies.radio_bound import RadioBound, TrueStep, radio_bound
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import best_motion, rms, rms_m, wrapped
+from ccatp.filters.metrics import rms, wrapped
 from ccatp.kinematics import wrap_pi
 from ccatp.missions import Part
 from ccatp.report.plots import INK

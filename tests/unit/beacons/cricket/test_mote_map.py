@@ -17,7 +17,7 @@ from ccatp.beacons.cricket.map_start import classical_scaling, completed, grown,
 from ccatp.beacons.cricket.mote_map import map_motes, pinned_map, plain_frame, residual_scale, scaled, unfold
 from ccatp.beacons.cricket.range_network import RangeNetwork, RigidBody, components
 from ccatp.beacons.cricket.rigidity import find_fold_over
-from ccatp.filters.metrics import aligned_rms_m, best_motion
+from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
 from tests.unit.beacons.cricket.fields import (
     ALL,
     FORTY_FIVE,

@@ -13,6 +13,7 @@ from ccatp.beacons.config.models import FixedLagConfig
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.trajectory import bridged
 from ccatp.beacons.filters.ekf_slam import BlockError
+from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
 from ccatp.beacons.slam.batch_smoother import lagged_run, smooth
 from ccatp.beacons.slam.beacon_slam import BeaconSlam, recorded_slam
 from ccatp.beacons.slam.causal import filter_run
@@ -29,7 +30,6 @@ from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import BeaconId, EstimatedPath, Reading, RecordedRun, Steps
 from ccatp.beacons.slam.track_review import range_residuals
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import aligned_rms_m, best_motion
 from ccatp.kinematics import wrap_pi
 from tests.support.slam_settings import Settings, odometry, settings, trust
 from tests.unit.beacons.datasets.sets import recorded, world
