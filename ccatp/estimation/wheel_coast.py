@@ -12,8 +12,8 @@ What is not known, as the covariance of both angles' errors since the begin of t
   1 - exp(-t/T);
 * the load of a wheel (slope, friction): a real servo follows its set point only to a share of the travel, which is
   learned from d - T w since the last rest; within the gap the rate is wrong by twice this share, and the servo may
-  correct what it owes or not. Both wheels owe in part the same, so the share is learned for their mean and for their
-  difference, each in the direction of its wheel, and apart for legs and turns;
+  correct the shortfall or not. It is in part the same for both wheels, so the share is learned for their mean and for
+  their difference, each in the direction of its wheel, and apart for legs and turns;
 * T: its learned standard deviation, times the change of the follow error with T;
 * the moment at which a robot held its wheels by a rule of its own, see ``SetPoints``;
 * the set points, where they are not known: anything from the recent rate on to an immediate stop.
@@ -57,7 +57,7 @@ WheelInput = SetPoints | CoastedMotion | None
 
 
 class LoadShares(NamedTuple):
-    """Variance of the share of its travel that a wheel owes: ``mean`` of both wheels, ``half`` of their difference.
+    """Variance of the share of travel by which wheels fall short: ``mean`` of both, ``half`` of their difference.
 
     ``seen``: weight of the motion from which it is known, rad^4 s. The error of a share falls with the travel, its
     variance with the fourth power of it.
@@ -78,7 +78,7 @@ class LoadShares(NamedTuple):
         return self.mean - self.half
 
     def learned(self, dt_s: float, travel_rad: float, mean_rad2: float, half_rad2: float) -> "LoadShares":
-        """With the square of what mean and half difference owe after a travel, in ``dt_s`` of motion."""
+        """With the squares of the shortfalls after a travel, in ``dt_s`` of motion."""
         travel2, least2 = travel_rad * travel_rad, 0.5 * _LEAST_LOAD_SHARE**2
         new = dt_s * travel2 * travel2
         seen = self.seen * max(1.0 - dt_s / _LOAD_MEMORY_S, 0.0) + new
@@ -128,15 +128,18 @@ class WheelCoast:
             return
         of_rate = (self._lag_s * _RATE_SIGMA_RAD_S) ** 2
         rates, is_turn = (right_rad_s, left_rad_s), right_rad_s * left_rad_s < 0.0
-        owed = [follow - self._lag_s * rate for follow, rate in zip(self._follows, rates, strict=True)]
+        shortfalls = [follow - self._lag_s * rate for follow, rate in zip(self._follows, rates, strict=True)]
         travel = 0.5 * (self._travels[0] + self._travels[1])
         if travel > _LOADED_RAD and min(abs(right_rad_s), abs(left_rad_s)) >= _FAST_RAD_S:
-            right, left = copysign(owed[0], owed[0] * right_rad_s), copysign(owed[1], owed[1] * left_rad_s)
+            right, left = (
+                copysign(shortfalls[0], shortfalls[0] * right_rad_s),
+                copysign(shortfalls[1], shortfalls[1] * left_rad_s),
+            )
             # The error of the lag is the same for both wheels, that of the rates is not.
             mean2 = (0.5 * (right + left)) ** 2 - 0.5 * of_rate - self._spread2 * right_rad_s * right_rad_s
             half2 = (0.5 * (right - left)) ** 2 - 0.5 * of_rate
             self._shares[is_turn] = self._shares[is_turn].learned(dt_s, travel, mean2, half2)
-        for rate, off, travel in zip(rates, owed, self._travels, strict=True):
+        for rate, off, travel in zip(rates, shortfalls, self._travels, strict=True):
             if -_FAST_RAD_S < rate < _FAST_RAD_S:
                 continue
             load = self._shares[is_turn].one * travel * travel
@@ -162,14 +165,14 @@ class WheelCoast:
         kept = [0.0, 0.0]
         for k, rate in enumerate(self._free):
             # Two estimates of the follow error: the measured one, and lag times rate.
-            owed2 = shares.one * self._travels[k] ** 2
-            own = (_DEAD_TIME_S * rate) ** 2 + 2.0 * reading_rad2 + owed2
+            shortfall2 = shares.one * self._travels[k] ** 2
+            own = (_DEAD_TIME_S * rate) ** 2 + 2.0 * reading_rad2 + shortfall2
             of_rate = self._spread2 * rate * rate + (lag_s * _RATE_SIGMA_RAD_S) ** 2
             kept[k] = of_rate / (own + of_rate) if self._is_known else 0.0
             follows[k] += (1.0 - kept[k]) * (lag_s * rate - follows[k])
-            first2[k] = kept[k] * own + owed2 if self._is_known else of_rate + owed2
-        owed2 = shares.both * self._travels[0] * self._travels[1]
-        first2[2] = self._sign() * owed2 * (1.0 + sqrt(kept[0] * kept[1]))
+            first2[k] = kept[k] * own + shortfall2 if self._is_known else of_rate + shortfall2
+        shortfall2 = shares.both * self._travels[0] * self._travels[1]
+        first2[2] = self._sign() * shortfall2 * (1.0 + sqrt(kept[0] * kept[1]))
 
     def _sign(self) -> float:
         """Of the product of both wheels' directions."""
