@@ -12,12 +12,12 @@ from ccatp.beacons.cricket.mote_plan import network_plan
 from ccatp.beacons.cricket.range_network import build_network, pair_range
 from ccatp.beacons.cricket.self_mapping import MoteMapper, begin_phase_two
 from ccatp.beacons.cricket.trilateration import map_by_plan
+from ccatp.beacons.estimation.motion import POSE, Increment, Odometry, SlippingVehicle, Steering
+from ccatp.beacons.estimation.recording import Reading
+from ccatp.beacons.estimation.signal_slam import ReflectorScan, SignalSlam
 from ccatp.beacons.filters.ekf_slam import EkfSlam, columns_of
 from ccatp.beacons.links.messages import BeaconFrame, Ellipse, MoteBurst, RadioScan, worst_sigma_m
 from ccatp.beacons.pilot import TargetSight
-from ccatp.beacons.slam.motion import POSE, Increment, Odometry, SlippingVehicle, Steering
-from ccatp.beacons.slam.recording import Reading
-from ccatp.beacons.slam.signal_slam import ReflectorScan, SignalSlam
 from ccatp.core import FloatArray, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.sensing.sample_times import LATEST_S, possible_samples

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.beacons.slam.beacon_slam import BeaconSlam, recorded_slam
-from ccatp.beacons.slam.motion import Increment
-from ccatp.beacons.slam.recording import Reading
+from ccatp.beacons.estimation.beacon_slam import BeaconSlam, recorded_slam
+from ccatp.beacons.estimation.motion import Increment
+from ccatp.beacons.estimation.recording import Reading
 from ccatp.config.models import LocalizerConfig
 from ccatp.core import FloatArray, PanelId, PanelPose
 from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle

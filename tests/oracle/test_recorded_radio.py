@@ -7,9 +7,9 @@ import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.datasets.reader import read_run
-from ccatp.beacons.slam.batch_smoother import smooth
-from ccatp.beacons.slam.evaluation import TrackEvaluation, judge, result_data
-from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
+from ccatp.beacons.estimation.batch_smoother import smooth
+from ccatp.beacons.estimation.evaluation import TrackEvaluation, judge, result_data
+from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.studies.recordings import estimate, shipped_window
 
 PLAZA2_S = 409.523  # how long it takes

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import RecordingConfig, SlamFilterConfig
-from ccatp.beacons.slam.motion import DifferentialDrive
+from ccatp.beacons.estimation.motion import DifferentialDrive
 
 _NOTHING: dict[str, object] = {
     **{f"odometry__{axis}": 0.0 for axis in ("distance_per_sqrt_rad", "turn_per_sqrt_s", "lateral_per_sqrt_m")},

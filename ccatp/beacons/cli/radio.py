@@ -14,7 +14,7 @@ from ccatp.cli import common
 
 if TYPE_CHECKING:
     from ccatp.beacons.config.models import CricketConfig
-    from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
+    from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 
 FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 
@@ -59,8 +59,8 @@ def slam(
     """
     from ccatp.beacons.config.load import load_recordings_config
     from ccatp.beacons.datasets.reader import read_run
-    from ccatp.beacons.slam.evaluation import judge, result_data, table_lines
-    from ccatp.beacons.slam.track_review import review_lines, reviewed
+    from ccatp.beacons.estimation.evaluation import judge, result_data, table_lines
+    from ccatp.beacons.estimation.track_review import review_lines, reviewed
     from ccatp.beacons.studies.recordings import COMPARED, compared, estimate
     from ccatp.studies.results import markdown_table
 
@@ -92,7 +92,7 @@ def slam(
 def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:
     import numpy as np
 
-    from ccatp.beacons.slam.track_review import tum_lines
+    from ccatp.beacons.estimation.track_review import tum_lines
 
     paths = {file: (track.times_s, track.poses)}
     if run.truth is not None:

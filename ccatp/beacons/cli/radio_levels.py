@@ -10,8 +10,8 @@ import click
 from ccatp.cli import common
 
 if TYPE_CHECKING:
-    from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace
-    from ccatp.beacons.slam.path_loss import PathLossFit
+    from ccatp.beacons.estimation.level_fix import LevelLocator, MeasuredPlace
+    from ccatp.beacons.estimation.path_loss import PathLossFit
     from ccatp.core import FloatArray
 
     Places = dict[str, tuple[float, float]]
@@ -35,7 +35,7 @@ def calibrate(path: Path, sheet: str | None, points: Path | None, figure_file: P
     """Find reference level, exponent and spread of a radio from pairs of distance and level."""
     from ccatp.beacons.datasets.sheets import read_levels
     from ccatp.beacons.datasets.tables import RadioDataError
-    from ccatp.beacons.slam.path_loss import PathLossError, fit_path_loss
+    from ccatp.beacons.estimation.path_loss import PathLossError, fit_path_loss
 
     name, pairs, warnings = read_levels(path, sheet, points)
     try:
@@ -102,8 +102,8 @@ def fix(
     """Find each place of PATH from one level of each beacon, and judge the errors and the 90 % regions."""
     from ccatp.beacons.datasets.sheets import read_level_places, read_levels
     from ccatp.beacons.datasets.tables import RadioDataError
-    from ccatp.beacons.slam.level_fix import LevelLocator, fingerprint_fits, judged
-    from ccatp.beacons.slam.path_loss import PathLossError, fit_path_loss
+    from ccatp.beacons.estimation.level_fix import LevelLocator, fingerprint_fits, judged
+    from ccatp.beacons.estimation.path_loss import PathLossError, fit_path_loss
 
     places_m = _beacons(beacons)
     area = _room(room, places_m, spacing_m)
@@ -166,7 +166,7 @@ def _beacons(texts: Sequence[str]) -> "Places":
 
 def _room(text: str | None, places_m: "Places", spacing_m: float) -> "FloatArray":
     """Points of a grid over the room, shape (n, 2)."""
-    from ccatp.beacons.slam.level_fix import grid_points
+    from ccatp.beacons.estimation.level_fix import grid_points
 
     if text is not None:
         x0, y0, x1, y1 = _coordinates(f"--room {text}", text, "X0,Y0,X1,Y1")
@@ -198,7 +198,7 @@ def _exchanged(places: "tuple[MeasuredPlace, ...]", exchange: str) -> "tuple[Mea
 
 
 def _doubtful_names(locator: "LevelLocator", places: "Sequence[MeasuredPlace]") -> list[str]:
-    from ccatp.beacons.slam.level_fix import likeliest_names
+    from ccatp.beacons.estimation.level_fix import likeliest_names
 
     names, gain = likeliest_names(locator, places)
     moved = [f"{old} is {new}" for old, new in names.items() if old != new]

@@ -31,8 +31,8 @@ from ccatp.beacons.cricket.range_network import (
 )
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
 from ccatp.beacons.cricket.self_mapping import MoteMapper, run_phase_two
+from ccatp.beacons.estimation.track_review import next_range
 from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
-from ccatp.beacons.slam.track_review import next_range
 from ccatp.core import FloatArray
 
 _SIGNIFICANT = 12.0  # decrease of chi-squared by one offset; by chance once in two thousand

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from ccatp.beacons.cricket.map_fit import map_rms_m
 from ccatp.beacons.datasets.tables import GAP_S, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor
+from ccatp.beacons.estimation.recording import EstimatedPath, Readings, RecordedRun, ReferencePath, Steps
 from ccatp.beacons.rigid_motion import aligned_rms_m
-from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray
 
 MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation

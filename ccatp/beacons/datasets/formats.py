@@ -30,7 +30,7 @@ from ccatp.beacons.datasets.trajectory import (
     steps_of_speeds,
     turning_factor,
 )
-from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
+from ccatp.beacons.estimation.recording import Readings, RecordedRun, ReferencePath, Steps
 from ccatp.config.files import read_input
 from ccatp.core import FloatArray
 

@@ -20,7 +20,7 @@ from ccatp.beacons.datasets.formats import (
 from ccatp.beacons.datasets.ros_bags import SUFFIXES as BAGS
 from ccatp.beacons.datasets.ros_bags import read_bag
 from ccatp.beacons.datasets.tables import RadioDataError, content_lines, plural, read_text
-from ccatp.beacons.slam.recording import RecordedRun
+from ccatp.beacons.estimation.recording import RecordedRun
 from ccatp.core import FloatArray
 
 LEAST_TRUTH = 2  # rows; a single position fits any path

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 
 from ccatp.beacons.datasets.formats import run_of_events
 from ccatp.beacons.datasets.tables import RadioDataError, tables_of
-from ccatp.beacons.slam.recording import RecordedRun
+from ccatp.beacons.estimation.recording import RecordedRun
 from ccatp.config.files import read_input
 from ccatp.config.models import Model
 from ccatp.kinematics import wrap_pi

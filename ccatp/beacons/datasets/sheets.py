@@ -17,8 +17,8 @@ import tomlkit
 from ccatp.beacons.cricket.measured_map import MeasuredRanges
 from ccatp.beacons.cricket.range_network import MoteRange
 from ccatp.beacons.datasets.tables import RadioDataError, content_lines, number, read_text, split_cells
-from ccatp.beacons.slam.level_fix import MeasuredPlace
-from ccatp.beacons.slam.path_loss import LevelPair
+from ccatp.beacons.estimation.level_fix import MeasuredPlace
+from ccatp.beacons.estimation.path_loss import LevelPair
 from ccatp.config.files import read_input
 from ccatp.core import FloatArray
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.slam.recording import BoolArray
+from ccatp.beacons.estimation.recording import BoolArray
 from ccatp.config.files import read_input
 from ccatp.core import FloatArray, IntArray
 from ccatp.errors import CcatpError, ExitStatus

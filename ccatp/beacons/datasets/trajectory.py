@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.beacons.datasets.tables import long_pauses
-from ccatp.beacons.slam.recording import ReferencePath, Steps, antenna_path, dead_reckoned, running_total
+from ccatp.beacons.estimation.recording import ReferencePath, Steps, antenna_path, dead_reckoned, running_total
 from ccatp.core import FloatArray
 
 BEFORE_S = 1.0  # time before a gap over which the speed is measured

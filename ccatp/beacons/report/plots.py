@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from ccatp.beacons.config.models import FuzzyConfig
-from ccatp.beacons.slam.evaluation import TrackEvaluation, aligned_beacons, truth_at
-from ccatp.beacons.slam.level_fix import LevelFix
-from ccatp.beacons.slam.path_loss import LevelPair, PathLossFit
-from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, dead_reckoned
-from ccatp.beacons.slam.track_review import range_residuals
+from ccatp.beacons.estimation.evaluation import TrackEvaluation, aligned_beacons, truth_at
+from ccatp.beacons.estimation.level_fix import LevelFix
+from ccatp.beacons.estimation.path_loss import LevelPair, PathLossFit
+from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, dead_reckoned
+from ccatp.beacons.estimation.track_review import range_residuals
 from ccatp.beacons.steering import Sugeno
 from ccatp.core import FloatArray
 from ccatp.report.plots import GRID, INK, QUIET, add_legend, dress, ellipse_outline, new_figure, save_figure

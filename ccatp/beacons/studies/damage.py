@@ -10,8 +10,8 @@ import numpy as np
 
 from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.datasets.tables import RadioDataError, Table
-from ccatp.beacons.slam.evaluation import TrackEvaluation, judge, truth_at
-from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, ReferencePath
+from ccatp.beacons.estimation.evaluation import TrackEvaluation, judge, truth_at
+from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, ReferencePath
 from ccatp.beacons.studies.recordings import (
     FILTERS,
     SETS,

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.estimation.motion import POSE, Odometry, SlippingVehicle
+from ccatp.beacons.estimation.signal_slam import MovingRadio
 from ccatp.beacons.filters.ekf_slam import BlockId, EkfSlam, columns_of
-from ccatp.beacons.slam.motion import POSE, Odometry, SlippingVehicle
-from ccatp.beacons.slam.signal_slam import MovingRadio
 from ccatp.core import FloatArray
 
 _ANYWHERE = 10.0  # times the size of the room: standard deviation of an unknown position

@@ -23,15 +23,15 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.estimation.path_loss import PathLoss
+from ccatp.beacons.estimation.recording import Reading
+from ccatp.beacons.estimation.signal_slam import ReflectorScan
 from ccatp.beacons.links.messages import RadioScan
 from ccatp.beacons.navigation import BeaconMeasurements, RadioNavigator, odometry_of, packets_of
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.rigid_motion import best_motion, rms_m
 from ccatp.beacons.sim.radio import SimDriveCommand, TruePose, TrueRadio
 from ccatp.beacons.sim.radio_world import RadioWorld
-from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.recording import Reading
-from ccatp.beacons.slam.signal_slam import ReflectorScan
 from ccatp.beacons.steering import HALT
 from ccatp.beacons.studies.radio_bound import RadioBound, TrueStep, radio_bound
 from ccatp.core import FloatArray

@@ -22,12 +22,12 @@ from ccatp.beacons.datasets.reader import checked_run, read_run
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
 from ccatp.beacons.datasets.tables import Table
 from ccatp.beacons.datasets.trajectory import pose_of_truth
-from ccatp.beacons.slam.batch_smoother import lagged_run, smooth
-from ccatp.beacons.slam.causal import filter_run
-from ccatp.beacons.slam.evaluation import judge, result_data
-from ccatp.beacons.slam.level_fix import LevelLocator, fingerprint_fits, grid_points, judged
-from ccatp.beacons.slam.path_loss import fit_path_loss
-from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, ReferencePath
+from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
+from ccatp.beacons.estimation.causal import filter_run
+from ccatp.beacons.estimation.evaluation import judge, result_data
+from ccatp.beacons.estimation.level_fix import LevelLocator, fingerprint_fits, grid_points, judged
+from ccatp.beacons.estimation.path_loss import fit_path_loss
+from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, ReferencePath
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, import_gtsam, run_gtsam
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus

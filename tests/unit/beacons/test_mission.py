@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from ccatp.beacons.conditions import RADIO_SILENT
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.estimation.motion import Steering
 from ccatp.beacons.links.messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.beacons.mission import RULES, BeaconMission, WaypointArrival, check_beacon_robot, permitted, wheel_rates
 from ccatp.beacons.modes import VISITING
@@ -20,7 +21,6 @@ from ccatp.beacons.records.summary import BeaconSummary
 from ccatp.beacons.safety.rules import BeaconSafetyRules, ObstacleBuffer
 from ccatp.beacons.sim.radio_world import RadioWorld
 from ccatp.beacons.sim.robot import BeaconRobot
-from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
 from ccatp.conditions import ENCODERS_STALE, text_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
-from ccatp.beacons.slam.evaluation import judge
+from ccatp.beacons.estimation.evaluation import judge
 from ccatp.beacons.studies.gtsam_peer import PeerError, PeerGaveUp, run_gtsam
 from ccatp.cli import main
 from ccatp.filters.base import FilterDiverged

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.io
 
-from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps, dead_reckoned
+from ccatp.beacons.estimation.recording import Readings, RecordedRun, ReferencePath, Steps, dead_reckoned
 
 FloatArray = npt.NDArray[np.float64]
 BEACONS = {"6": (0.5, 4.0), "7": (7.5, 5.5), "8": (6.0, -1.0), "9": (-1.0, -0.5)}

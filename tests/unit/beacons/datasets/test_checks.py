@@ -8,7 +8,7 @@ import pytest
 
 from ccatp.beacons.datasets.checks import survey_doubts, suspicions
 from ccatp.beacons.datasets.reader import read_run
-from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, ReferencePath, Steps
+from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, RecordedRun, ReferencePath, Steps
 from tests.unit.beacons.datasets.sets import (
     BEACONS,
     labyrinth_lines,

@@ -13,7 +13,7 @@ from ccatp.beacons.datasets.formats import EVENTS
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.datasets.trajectory import LOST_RAD, bridged
-from ccatp.beacons.slam.recording import RecordedRun, Steps, dead_reckoned
+from ccatp.beacons.estimation.recording import RecordedRun, Steps, dead_reckoned
 from ccatp.core import FloatArray
 from ccatp.errors import ExitStatus
 from tests.unit.beacons.datasets.sets import (

@@ -12,8 +12,8 @@ from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.datasets.formats import read_events_csv
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.tables import RadioDataError
-from ccatp.beacons.slam.causal import filter_run
-from ccatp.beacons.slam.evaluation import judge
+from ccatp.beacons.estimation.causal import filter_run
+from ccatp.beacons.estimation.evaluation import judge
 from tests.unit.beacons.datasets.sets import BEACONS, World, csv_lines, world, write_lines
 
 rosbags = pytest.importorskip("rosbags", reason="the extra ros is not installed")

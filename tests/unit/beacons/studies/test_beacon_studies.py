@@ -9,7 +9,7 @@ import pytest
 
 from ccatp.beacons.config.load import load_radio_config, load_recordings_config
 from ccatp.beacons.cricket.mote_map import MoteMap, map_motes
-from ccatp.beacons.slam.motion import Steering
+from ccatp.beacons.estimation.motion import Steering
 from ccatp.beacons.studies import cricket_study, mote_runs
 from ccatp.beacons.studies.cricket_study import combine, run_job
 from ccatp.beacons.studies.damage import DAMAGES, Damage, run_damage

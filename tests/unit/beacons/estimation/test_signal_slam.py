@@ -8,12 +8,12 @@ from scipy.stats import chi2
 
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.estimation.level_fix import LevelLocator, MeasuredPlace, grid_points, likeliest_names
+from ccatp.beacons.estimation.motion import Increment, Odometry, SlippingVehicle, Steering
+from ccatp.beacons.estimation.path_loss import LevelPair, PathLoss, PathLossError, PathLossFit, fit_path_loss
+from ccatp.beacons.estimation.recording import Reading
+from ccatp.beacons.estimation.signal_slam import MovingRadio, SignalSlam
 from ccatp.beacons.filters.ekf_slam import EkfSlam
-from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace, grid_points, likeliest_names
-from ccatp.beacons.slam.motion import Increment, Odometry, SlippingVehicle, Steering
-from ccatp.beacons.slam.path_loss import LevelPair, PathLoss, PathLossError, PathLossFit, fit_path_loss
-from ccatp.beacons.slam.recording import Reading
-from ccatp.beacons.slam.signal_slam import MovingRadio, SignalSlam
 from ccatp.beacons.studies.radio_studies import run_radio
 
 ODOMETRY: dict[str, Odometry] = {

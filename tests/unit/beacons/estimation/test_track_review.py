@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
+from ccatp.beacons.estimation.causal import filter_run
+from ccatp.beacons.estimation.track_review import next_range, range_residuals, residuals_by_beacon
 from ccatp.beacons.rigid_motion import rigid_modes
-from ccatp.beacons.slam.causal import filter_run
-from ccatp.beacons.slam.track_review import next_range, range_residuals, residuals_by_beacon
 from ccatp.cli import main
 from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, recorded, world, write_lines
 

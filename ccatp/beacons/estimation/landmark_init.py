@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.estimation.measurement_models import MeasurementRow, scalars_of
+from ccatp.beacons.estimation.motion import POSE
+from ccatp.beacons.estimation.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.beacons.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
-from ccatp.beacons.slam.measurement_models import MeasurementRow, scalars_of
-from ccatp.beacons.slam.motion import POSE
-from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, RecordedRun, ReferencePath
 from ccatp.beacons.rigid_motion import RigidMotion, best_motion
-from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, ReferencePath
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import Consistency, consistency, nees, rms, wrapped
 

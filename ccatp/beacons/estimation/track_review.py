@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccatp.beacons.config.models import RadioNoiseConfig
+from ccatp.beacons.estimation.measurement_models import range_variance
+from ccatp.beacons.estimation.recording import Calibrated, EstimatedPath, RecordedRun, antenna_path
 from ccatp.beacons.rigid_motion import rigid_modes
-from ccatp.beacons.slam.measurement_models import range_variance
-from ccatp.beacons.slam.recording import Calibrated, EstimatedPath, RecordedRun, antenna_path
 from ccatp.core import FloatArray
 
 _PLACES = 200  # number of places along the path at which a next reading is considered

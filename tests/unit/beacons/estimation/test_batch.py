@@ -10,11 +10,18 @@ from scipy.spatial.transform import Rotation
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import OdometryNoiseConfig, PriorsConfig, RadioNoiseConfig, RecordingConfig
-from ccatp.beacons.rigid_motion import RigidMotion, aligned_rms_m, best_motion
-from ccatp.beacons.slam.batch_problem import BEACON, CALIBRATION, SHARED, BatchProblem, BatchState, Reckoning, repeats
-from ccatp.beacons.slam.batch_smoother import Factored, smooth, t_cost, t_weights
-from ccatp.beacons.slam.evaluation import judge, truth_at
-from ccatp.beacons.slam.recording import (
+from ccatp.beacons.estimation.batch_problem import (
+    BEACON,
+    CALIBRATION,
+    SHARED,
+    BatchProblem,
+    BatchState,
+    Reckoning,
+    repeats,
+)
+from ccatp.beacons.estimation.batch_smoother import Factored, smooth, t_cost, t_weights
+from ccatp.beacons.estimation.evaluation import judge, truth_at
+from ccatp.beacons.estimation.recording import (
     BeaconFix,
     EstimatedPath,
     Readings,
@@ -23,6 +30,7 @@ from ccatp.beacons.slam.recording import (
     Steps,
     dead_reckoned,
 )
+from ccatp.beacons.rigid_motion import RigidMotion, aligned_rms_m, best_motion
 from ccatp.filters.metrics import consistency, nees
 from tests.unit.beacons.datasets.sets import BEACONS, changed, recorded, world
 

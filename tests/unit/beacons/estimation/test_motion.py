@@ -10,11 +10,11 @@ import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import ScanConfig
-from ccatp.beacons.slam.causal import filter_run
-from ccatp.beacons.slam.evaluation import judge
-from ccatp.beacons.slam.motion import Increment
-from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun
-from ccatp.beacons.slam.signal_slam import ReflectorScan
+from ccatp.beacons.estimation.causal import filter_run
+from ccatp.beacons.estimation.evaluation import judge
+from ccatp.beacons.estimation.motion import Increment
+from ccatp.beacons.estimation.recording import EstimatedPath, Readings, RecordedRun
+from ccatp.beacons.estimation.signal_slam import ReflectorScan
 from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
 from tests.support.slam_settings import odometry, settings

@@ -12,23 +12,23 @@ from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import FixedLagConfig
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.trajectory import bridged
-from ccatp.beacons.filters.ekf_slam import BlockError
-from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
-from ccatp.beacons.slam.batch_smoother import lagged_run, smooth
-from ccatp.beacons.slam.beacon_slam import BeaconSlam, recorded_slam
-from ccatp.beacons.slam.causal import filter_run
-from ccatp.beacons.slam.evaluation import judge, result_data
-from ccatp.beacons.slam.measurement_models import (
+from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
+from ccatp.beacons.estimation.beacon_slam import BeaconSlam, recorded_slam
+from ccatp.beacons.estimation.causal import filter_run
+from ccatp.beacons.estimation.evaluation import judge, result_data
+from ccatp.beacons.estimation.measurement_models import (
     LevelModel,
     MeasurementModel,
     MeasurementRow,
     ShadowingMap,
     recorded_models,
 )
-from ccatp.beacons.slam.motion import Increment
-from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.recording import BeaconId, EstimatedPath, Reading, RecordedRun, Steps
-from ccatp.beacons.slam.track_review import range_residuals
+from ccatp.beacons.estimation.motion import Increment
+from ccatp.beacons.estimation.path_loss import PathLoss
+from ccatp.beacons.estimation.recording import BeaconId, EstimatedPath, Reading, RecordedRun, Steps
+from ccatp.beacons.estimation.track_review import range_residuals
+from ccatp.beacons.filters.ekf_slam import BlockError
+from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
 from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
 from tests.support.slam_settings import Settings, odometry, settings, trust

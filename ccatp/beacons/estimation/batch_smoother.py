@@ -13,15 +13,15 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
 from ccatp.beacons.config.models import FixedLagConfig, RadioNoiseConfig, RecordingConfig, SlamFilterConfig
+from ccatp.beacons.estimation.batch_problem import BEACON, RSSI_REFERENCE, SHARED, ArrowSystem, BatchProblem, BatchState
+from ccatp.beacons.estimation.beacon_slam import BeaconSlam
+from ccatp.beacons.estimation.causal import beyond_priors, follow
+from ccatp.beacons.estimation.evaluation import aligned_beacons
+from ccatp.beacons.estimation.landmark_init import LEAST
+from ccatp.beacons.estimation.motion import POSE
+from ccatp.beacons.estimation.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun, Steps
 from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.beacons.rigid_motion import best_motion
-from ccatp.beacons.slam.batch_problem import BEACON, RSSI_REFERENCE, SHARED, ArrowSystem, BatchProblem, BatchState
-from ccatp.beacons.slam.beacon_slam import BeaconSlam
-from ccatp.beacons.slam.causal import beyond_priors, follow
-from ccatp.beacons.slam.evaluation import aligned_beacons
-from ccatp.beacons.slam.landmark_init import LEAST
-from ccatp.beacons.slam.motion import POSE
-from ccatp.beacons.slam.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun, Steps
 from ccatp.core import FloatArray
 
 LEAST_DAMPING = 1e-9

@@ -7,8 +7,8 @@ from math import exp
 import numpy as np
 from scipy.linalg.blas import daxpy
 
+from ccatp.beacons.estimation.recording import BeaconId
 from ccatp.beacons.filters.ekf_slam import Columns, EkfSlam, columns_of
-from ccatp.beacons.slam.recording import BeaconId
 from ccatp.core import FloatArray
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ccatp.beacons.slam.path_loss import LevelPair, PathLossFit, fit_path_loss
+from ccatp.beacons.estimation.path_loss import LevelPair, PathLossFit, fit_path_loss
 from ccatp.core import FloatArray
 
 _NEAREST_M = 0.1  # smallest distance for which the log-distance model is used

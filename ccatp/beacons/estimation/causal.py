@@ -9,11 +9,19 @@ from math import inf, pi, sqrt
 import numpy as np
 
 from ccatp.beacons.config.models import FixedLagConfig, RecordingConfig, SlamFilterConfig
+from ccatp.beacons.estimation.beacon_map import HEADING
+from ccatp.beacons.estimation.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
+from ccatp.beacons.estimation.motion import POSE, Increment
+from ccatp.beacons.estimation.recording import (
+    BeaconFix,
+    Calibrated,
+    DelayedPath,
+    EstimatedPath,
+    Reading,
+    RecordedRun,
+    Steps,
+)
 from ccatp.beacons.filters.ekf_slam import columns_of
-from ccatp.beacons.slam.beacon_map import HEADING
-from ccatp.beacons.slam.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
-from ccatp.beacons.slam.motion import POSE, Increment
-from ccatp.beacons.slam.recording import BeaconFix, Calibrated, DelayedPath, EstimatedPath, Reading, RecordedRun, Steps
 from ccatp.core import FloatArray
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported

@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 
 from ccatp.beacons.config.models import PriorsConfig, RadioNoiseConfig
-from ccatp.beacons.slam.level_fix import grid_points
-from ccatp.beacons.slam.motion import estimated
-from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.recording import BeaconId, Reading
+from ccatp.beacons.estimation.level_fix import grid_points
+from ccatp.beacons.estimation.motion import estimated
+from ccatp.beacons.estimation.path_loss import PathLoss
+from ccatp.beacons.estimation.recording import BeaconId, Reading
 from ccatp.core import FloatArray
 
 DB = 10.0 / math.log(10.0)

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from ccatp.beacons.config.models import OdometryNoiseConfig, RecordingConfig
-from ccatp.beacons.slam.measurement_models import bearing_row, level_row, range_row, range_variance
-from ccatp.beacons.slam.motion import POSE, step_variances, turned_way
-from ccatp.beacons.slam.recording import BoolArray, Readings, Steps, running_total
+from ccatp.beacons.estimation.measurement_models import bearing_row, level_row, range_row, range_variance
+from ccatp.beacons.estimation.motion import POSE, step_variances, turned_way
+from ccatp.beacons.estimation.recording import BoolArray, Readings, Steps, running_total
 from ccatp.core import FloatArray, IntArray
 from ccatp.filters.metrics import wrapped
 

@@ -8,8 +8,7 @@ import msgspec
 import numpy as np
 
 from ccatp.beacons.config.models import RecordingConfig, SlamFilterConfig
-from ccatp.beacons.filters.ekf_slam import BlockError, Columns, EkfSlam, RowUpdate, columns_of
-from ccatp.beacons.slam.beacon_map import (
+from ccatp.beacons.estimation.beacon_map import (
     FURTHEST,
     HEADING,
     AddedPoseNoise,
@@ -19,7 +18,7 @@ from ccatp.beacons.slam.beacon_map import (
     MapEntry,
     NoiseLevel,
 )
-from ccatp.beacons.slam.landmark_init import (
+from ccatp.beacons.estimation.landmark_init import (
     LEAST,
     LINEARISATIONS,
     TRIAL,
@@ -28,14 +27,14 @@ from ccatp.beacons.slam.landmark_init import (
     ReadingRecord,
     StackedRows,
 )
-from ccatp.beacons.slam.measurement_models import (
+from ccatp.beacons.estimation.measurement_models import (
     MeasurementModels,
     MeasurementRow,
     is_direction,
     recorded_models,
     scalars_of,
 )
-from ccatp.beacons.slam.motion import (
+from ccatp.beacons.estimation.motion import (
     POSE,
     CarriedOdometry,
     DeadReckoning,
@@ -46,7 +45,8 @@ from ccatp.beacons.slam.motion import (
     VehiclePose,
     estimated,
 )
-from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
+from ccatp.beacons.estimation.recording import BeaconEstimate, BeaconId, Reading
+from ccatp.beacons.filters.ekf_slam import BlockError, Columns, EkfSlam, RowUpdate, columns_of
 from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
 

@@ -9,13 +9,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.beacons.config.models import RadioConfig, ScanConfig, SlamFilterConfig
+from ccatp.beacons.estimation.beacon_slam import PLACE, BeaconInnovation, BeaconSlam
+from ccatp.beacons.estimation.landmark_init import PendingLandmark, StackedRows
+from ccatp.beacons.estimation.measurement_models import BearingModel, LevelModel, MeasurementModels, ShadowingMap
+from ccatp.beacons.estimation.motion import POSE, Odometry, SlippingVehicle, VehiclePose
+from ccatp.beacons.estimation.path_loss import PathLoss
+from ccatp.beacons.estimation.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.beacons.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
-from ccatp.beacons.slam.beacon_slam import PLACE, BeaconInnovation, BeaconSlam
-from ccatp.beacons.slam.landmark_init import PendingLandmark, StackedRows
-from ccatp.beacons.slam.measurement_models import BearingModel, LevelModel, MeasurementModels, ShadowingMap
-from ccatp.beacons.slam.motion import POSE, Odometry, SlippingVehicle, VehiclePose
-from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
 
