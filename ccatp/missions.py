@@ -49,15 +49,15 @@ class MissionKind:
     load: Part  # config.load.LoadConfig
     shipped: Part | None = None  # Callable[[C], C]: what a configuration is compared with, if not that of its system
     # The run: texts, what is checked before it begins, processes, summary.
-    text: Part = Part("ccatp.daemon.run_text:plain_text")  # Callable[[C], daemon.run_text.RunText]
-    check: Part | None = None  # Callable[[daemon.run_dir.RunOptions, C], None], raises ConfigError
+    text: Part = Part("ccatp.daemon.supervision.run_text:plain_text")  # Callable[[C], RunText]
+    check: Part | None = None  # Callable[[run_dir.RunOptions, C], None], raises ConfigError
     without_effect: Part | None = None  # Callable[[C], list[str]]: a line for each key that was set and does nothing
     resumed: Part | None = None  # Callable[[C, Path], None], raises ConfigError: the run in a folder is another one
-    processes: Part = Part("ccatp.daemon.supervisor:WITHOUT_LASER")  # tuple[daemon.child_processes.ProcessSpec, ...]
+    processes: Part = Part("ccatp.daemon.supervision.supervisor:WITHOUT_LASER")  # tuple[ProcessSpec, ...]
     record: Part = Part("ccatp.records.run_record:status_record")  # Callable[[C, Path, RobotClock, bool], RunRecord]
     # Main loop, danger loop, simulated robot.
     runner: Part  # Callable[[C, ProcessArgs], AbstractContextManager[Callable[[MainLoop], MissionRunner]]]
-    limits: Part = Part("ccatp.daemon.mission_runner:usual_limits")  # Callable[[C], daemon.mission_runner.LoopLimits]
+    limits: Part = Part("ccatp.daemon.loops.mission_runner:usual_limits")  # Callable[[C], LoopLimits]
     rules: Part = Part("ccatp.safety.rules:emergency_rules")  # Callable[[C], safety.rules.SafetyRules]
     stand_in: Part  # Callable[[C, dataloop.StandInOptions], dataloop.StandIn]
     # Views: the web page of a run, the report on it.

@@ -385,7 +385,7 @@ def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Pat
 
     running = running_in(runtime_dir_path("", os.environ))
     if len(running) > 1:
-        from ccatp.daemon.process import run_dir_in
+        from ccatp.daemon.supervision.process import run_dir_in
 
         runs = [f"{folder} ({run_dir.name if (run_dir := run_dir_in(folder)) else 'starts'})" for folder in running]
         raise ConfigError(f"{len(running)} runs are in progress; choose one with --runtime-dir: {', '.join(runs)}")

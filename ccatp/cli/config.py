@@ -30,7 +30,7 @@ def config_check(file: Path) -> int:
     Check it on the machine where it will be used, because keys and tokens are files of this machine.
     """
     from ccatp.config.load import load_mission
-    from ccatp.daemon.named_files import check_named_files
+    from ccatp.daemon.supervision.named_files import check_named_files
     from ccatp.missions import kind_of
 
     try:

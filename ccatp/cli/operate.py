@@ -35,7 +35,7 @@ def _print_reply(reply: Mapping[str, Any], json_output: bool, page: str = "") ->
     if json_output:
         click.echo(json.dumps(reply))
         return
-    from ccatp.daemon.terminal import status_rows
+    from ccatp.daemon.operator.terminal import status_rows
 
     facts, status = [(name, str(value)) for name, value in reply.items() if name != "ok"], reply.get("status")
     rows = list(status_rows(status)) if isinstance(status, Mapping) else facts
@@ -174,8 +174,8 @@ def ack(name: str, config_file: Path | None, runtime_dir: Path | None, timeout_s
 @common.json_option("The events as JSON on standard output.")
 def history(run_dir: Path | None, config_file: Path | None, runtime_dir: Path | None, json_output: bool) -> None:
     """Show what happened to the alarms of the running daemon, or of the run in RUN_DIR, oldest first."""
-    from ccatp.daemon.alarms import read_history
-    from ccatp.daemon.process import run_dir_in
+    from ccatp.daemon.operator.alarms import read_history
+    from ccatp.daemon.supervision.process import run_dir_in
     from ccatp.links.runtime_dir import runtime_dir_path
 
     if run_dir is None:
@@ -207,7 +207,7 @@ def status(
     """Show what the running daemon is doing."""
     folder = common.configured_folder(config_file, runtime_dir)
     if not watch:
-        from ccatp.daemon.child_processes import page_address
+        from ccatp.daemon.supervision.child_processes import page_address
         from ccatp.links.runtime_dir import runtime_dir_path
 
         reply = _ask(folder, "status", timeout_s)
@@ -242,7 +242,7 @@ def _answers(folder: Path | None, timeout_s: float, period_s: float) -> Iterator
 
 
 def _watch_lines(answers: Iterator[dict[str, Any]]) -> None:
-    from ccatp.daemon.terminal import status_line
+    from ccatp.daemon.operator.terminal import status_line
 
     shown, shown_s = tuple[object, ...](), 0.0
     for answer in answers:
@@ -258,7 +258,7 @@ def _watch_terminal(answers: Iterator[dict[str, Any]]) -> None:
     from rich.live import Live
     from rich.table import Table
 
-    from ccatp.daemon.terminal import status_rows
+    from ccatp.daemon.operator.terminal import status_rows
 
     with Live(auto_refresh=False) as live:
         for answer in answers:

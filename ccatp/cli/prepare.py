@@ -122,8 +122,8 @@ def calibrate(
     if not sim and config_file is None and from_dir is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
     if from_dir is None:
-        from ccatp.daemon.run_dir import RunOptions
-        from ccatp.daemon.supervisor import run_survey
+        from ccatp.daemon.supervision.run_dir import RunOptions
+        from ccatp.daemon.supervision.supervisor import run_survey
 
         changes = {
             **settings,

@@ -54,7 +54,7 @@ def run(
         raise click.UsageError("--start-held needs --resume; --resume-last always starts held")
     if recover and (resume or run_dir is not None):
         raise click.UsageError("--resume-last finds the run itself: leave out --resume and --run-dir")
-    from ccatp.daemon.run_dir import RunOptions, find_unfinished
+    from ccatp.daemon.supervision.run_dir import RunOptions, find_unfinished
 
     if resume and run_dir is None:
         run_dir = find_unfinished()
@@ -62,7 +62,7 @@ def run(
         config_file = run_dir / "config.toml"
     if not sim and config_file is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
-    from ccatp.daemon.supervisor import run as run_to_the_end
+    from ccatp.daemon.supervision.supervisor import run as run_to_the_end
 
     if faults_file is not None:
         from ccatp.sim.fault_plan import read_plan
@@ -88,7 +88,7 @@ def dashboard(runtime_dir: Path | None, settings: Mapping[str, object]) -> int:
 
     A run has a page of its own unless dashboard.enabled is false.
     """
-    from ccatp.daemon.dashboard import attach
+    from ccatp.daemon.operator.dashboard import attach
 
     return attach(common.configured_folder(None, runtime_dir), settings, click.echo)
 
@@ -112,7 +112,7 @@ def stream(
 
     It may be started and ended at any time; runs do not notice. A viewer that comes late gets the panels' map at once.
     """
-    from ccatp.daemon.streaming import serve
+    from ccatp.daemon.operator.streaming import serve
 
     foxglove_port = FOXGLOVE_PORT if foxglove and foxglove_port is None else foxglove_port
     if not plotjuggler and foxglove_port is None:

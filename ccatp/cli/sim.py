@@ -51,8 +51,8 @@ def sim_robot(
     Standard error says if it fell, and why; then the exit status is 4.
     """
     from ccatp.config.load import load_mission
-    from ccatp.daemon.run_dir import check_takes_faults
-    from ccatp.daemon.sim_robot import run_alone
+    from ccatp.daemon.loops.sim_robot import run_alone
+    from ccatp.daemon.supervision.run_dir import check_takes_faults
     from ccatp.missions import kind_of
     from ccatp.sim.fault_plan import read_plan
 
@@ -82,7 +82,7 @@ def sim_etalon(
 ) -> int:  # fmt: skip
     """Run the simulated MultiLine server; the puck stands at the base unless set otherwise."""
     from ccatp.config.load import load_config
-    from ccatp.daemon.sim_etalon import run_alone
+    from ccatp.daemon.loops.sim_etalon import run_alone
 
     if puck_world_m is not None and truth is not None:
         raise click.UsageError("--puck and --truth exclude each other")

@@ -34,9 +34,15 @@ from ccatp.commissioning.preflight import (
 from ccatp.config.files import read_key
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.daemon.child_processes import ProcessManager, ProcessSpec, listen, simulated_servers, with_addresses
-from ccatp.daemon.command_handlers import check_observatory
-from ccatp.daemon.supervisor import PROCESSES
+from ccatp.daemon.operator.command_handlers import check_observatory
+from ccatp.daemon.supervision.child_processes import (
+    ProcessManager,
+    ProcessSpec,
+    listen,
+    simulated_servers,
+    with_addresses,
+)
+from ccatp.daemon.supervision.supervisor import PROCESSES
 from ccatp.errors import CcatpError, ConfigError
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
 from ccatp.links.robot_link import ImpossibleRobot, RobotLink, RobotLinkError

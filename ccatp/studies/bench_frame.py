@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from ccatp.config.models import Config
 from ccatp.config.package import child_environment
-from ccatp.daemon.supervisor import PROCESSES
+from ccatp.daemon.supervision.supervisor import PROCESSES
 from ccatp.errors import CcatpError
 from ccatp.links.client import OperatorClient
 from ccatp.studies.calibrator import IDLE, LOADS, calibrate, load

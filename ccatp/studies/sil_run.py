@@ -17,8 +17,8 @@ from ccatp.clocks import SteadyTime
 from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, Fix, FloatArray, Measured, PanelPose, PointId, Verdict, unreliable_points
-from ccatp.daemon.mission_runner import STILL, DriveCommand, TimedFrame
-from ccatp.daemon.survey_runner import SurveyFrames
+from ccatp.daemon.loops.mission_runner import STILL, DriveCommand, TimedFrame
+from ccatp.daemon.loops.survey_runner import SurveyFrames
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import MotorRobot, motor_robot
 from ccatp.estimation.fixes import FixGated, FixRefused
@@ -272,7 +272,7 @@ class SilRun(SurveyFrames):
     def _note_truth(self) -> None:
         self.trace.note_truth(self.robot.truth_row())
 
-    # -- a frame, as in daemon.main_loop and daemon.danger_loop -------------------------------------------------------
+    # -- a frame, as in daemon.loops.main_loop and daemon.loops.danger_loop -------------------------------------------
 
     def _serve(self, sensors: Sensors, dt_s: float) -> None:
         robot, t_s = self.robot, sensors.t + self._time.offset_s
@@ -324,7 +324,7 @@ class SilRun(SurveyFrames):
         if frame.is_estimate_due:
             self._published = self._estimate_message(frame)
 
-    # -- a measurement, as in daemon.fix_service ----------------------------------------------------------------------
+    # -- a measurement, as in daemon.loops.fix_service ----------------------------------------------------------------
 
     def _measure(self, frame: Sensors) -> None:
         mission, localizer, laser = self.mission, self.localizer, self.laser

@@ -18,8 +18,8 @@ from structlog.testing import LogCapture
 from structlog.typing import FilteringBoundLogger
 
 from ccatp.config.models import Config
-from ccatp.daemon.dashboard import serve_page
-from ccatp.daemon.process import Endpoints
+from ccatp.daemon.operator.dashboard import serve_page
+from ccatp.daemon.supervision.process import Endpoints
 from ccatp.links.bus import Publisher
 from ccatp.links.channels import format_ok
 from ccatp.links.rpc import Router

@@ -20,7 +20,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.daemon.process import open_log
+from ccatp.daemon.supervision.process import open_log
 from ccatp.links.channels import format_error, format_ok
 from ccatp.report.dashboard.app import build_app
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig

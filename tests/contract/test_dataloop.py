@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ccatp import dataloop
 from ccatp.config.models import Config
-from ccatp.daemon import sim_robot
+from ccatp.daemon.loops import sim_robot
 from ccatp.dataloop import DataLoop, serve, survey_robot
 from ccatp.links.robot_messages import Sensors
 from tests.support.daemon import at_work, link_to

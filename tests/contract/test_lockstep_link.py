@@ -13,9 +13,9 @@ import pytest
 import zmq
 
 from ccatp.config.models import Config
-from ccatp.daemon import robot_loop
-from ccatp.daemon.process import Endpoints, ProcessArgs
-from ccatp.daemon.robot_loop import RobotLoop
+from ccatp.daemon.loops import robot_loop
+from ccatp.daemon.loops.robot_loop import RobotLoop
+from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_link import RobotTimeout
 from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Role, Sensors

@@ -22,7 +22,7 @@ from ccatp.config.robot_limits import (
     Limits,
     hello_problems,
 )
-from ccatp.daemon.robot_session import RobotSession
+from ccatp.daemon.loops.robot_session import RobotSession
 from ccatp.errors import ConfigError
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_link import ImpossibleRobot

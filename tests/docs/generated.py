@@ -18,7 +18,7 @@ from ccatp.cli import cli
 from ccatp.conditions import SAMPLE_RATES, Action, Condition, Group, all_conditions
 from ccatp.config.robot_limits import LIMITS
 from ccatp.core import EventCode, Severity
-from ccatp.daemon.supervisor import PROCESSES
+from ccatp.daemon.supervision.supervisor import PROCESSES
 from ccatp.links.topics import all_topics
 from ccatp.survey.failsafe import ROWS
 from tests.contract.test_conformance_broken import TABLES

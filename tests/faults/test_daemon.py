@@ -20,8 +20,8 @@ import pytest
 import ccatp
 from ccatp.conditions import text_of
 from ccatp.core import Cause
-from ccatp.daemon.danger_loop import DangerLoop
-from ccatp.daemon.main_loop import MainLoop
+from ccatp.daemon.loops.danger_loop import DangerLoop
+from ccatp.daemon.loops.main_loop import MainLoop
 from ccatp.errors import ExitStatus
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
@@ -82,7 +82,7 @@ async def test_while_a_robot_that_took_the_connection_reports_nothing(measured: 
 
 @pytest.mark.fault("P18")
 async def test_a_main_loop_whose_mission_is_over_waits_for_a_supervisor_that_is_behind() -> None:
-    with patch("ccatp.daemon.main_loop.SHUTDOWN_REPORT_S", 0.01):
+    with patch("ccatp.daemon.loops.main_loop.SHUTDOWN_REPORT_S", 0.01):
         async with running_daemon(configuration()) as daemon:
             daemon.main.finish(ExitStatus.COMPLETE)
             await daemon.until(lambda: len(daemon.events("shutdown_not_acknowledged")) >= 3)
@@ -96,14 +96,14 @@ async def test_a_main_loop_whose_mission_is_over_waits_for_a_supervisor_that_is_
 
 # Every task that the two loops serve, by the method that it runs.
 TASKS = (
-    "ccatp.daemon.main_loop.MainLoop.publish_heartbeat",
-    "ccatp.daemon.main_loop.MainLoop.watch",
-    "ccatp.daemon.danger_loop.DangerLoop.publish_heartbeat",
-    "ccatp.daemon.danger_loop.DangerLoop.watch",
-    "ccatp.daemon.fix_service.FixService.run",
-    "ccatp.daemon.robot_session.RobotSession.serve",
-    "ccatp.daemon.main_loop.MainLoop._serve_operator",
-    "ccatp.daemon.command_handlers.ObservatoryServer.serve",
+    "ccatp.daemon.loops.main_loop.MainLoop.publish_heartbeat",
+    "ccatp.daemon.loops.main_loop.MainLoop.watch",
+    "ccatp.daemon.loops.danger_loop.DangerLoop.publish_heartbeat",
+    "ccatp.daemon.loops.danger_loop.DangerLoop.watch",
+    "ccatp.daemon.loops.fix_service.FixService.run",
+    "ccatp.daemon.loops.robot_session.RobotSession.serve",
+    "ccatp.daemon.loops.main_loop.MainLoop._serve_operator",
+    "ccatp.daemon.operator.command_handlers.ObservatoryServer.serve",
 )
 
 
@@ -335,10 +335,10 @@ CALLS = {("time", "time"), ("time", "time_ns"), ("time", "localtime"), ("time", 
 # Labels: names of run directories and the observatory's feed say when they were made. The check before a mission shows
 # the clock itself.
 LABELS = {
-    "daemon/alarms.py",  # as operators read it; what decides is the order
-    "daemon/run_dir.py",
+    "daemon/operator/alarms.py",  # as operators read it; what decides is the order
+    "daemon/supervision/run_dir.py",
     "cli/prepare.py",
-    "daemon/ocs_agent.py",
+    "daemon/operator/ocs_agent.py",
     "commissioning/probes.py",
     "records/recorder.py",  # log times in UTC; what is read again goes by the robot's clock
     "report/dashboard/view.py",  # the clock that the page shows

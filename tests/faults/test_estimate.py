@@ -15,7 +15,7 @@ from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial
 from ccatp.core import Twist
-from ccatp.daemon.mission_runner import DriveCommand
+from ccatp.daemon.loops.mission_runner import DriveCommand
 from ccatp.links.robot_messages import Sensors
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.events import FixStored, MissionState

@@ -15,7 +15,7 @@ import pytest
 from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.core import Fix, PointId
-from ccatp.daemon.fix_service import FixRequest
+from ccatp.daemon.loops.fix_service import FixRequest
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonTimeout, StaleLengths
 from ccatp.links import multiline
 from ccatp.localizer import build_localizer

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from ccatp.conditions import GRIP_TOO_LITTLE, text_of
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, EmergencyKind, EventCode, Severity, Verdict
-from ccatp.daemon.mission_runner import STILL, DriveCommand
+from ccatp.daemon.loops.mission_runner import STILL, DriveCommand
 from ccatp.links.channels import format_ok
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.rpc import REPEAT_S, RequestFailed, request

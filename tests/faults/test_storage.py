@@ -13,8 +13,8 @@ import pytest
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
-from ccatp.daemon import fix_service as measuring
-from ccatp.daemon.process import LogStream, open_log
+from ccatp.daemon.loops import fix_service as measuring
+from ccatp.daemon.supervision.process import LogStream, open_log
 from ccatp.records.store import MissionStore, StoredPoint, StoreError
 from tests.faults.linking import Measured
 from tests.support.sim_survey import Desk, serving

@@ -28,7 +28,7 @@ from typing import Any
 import psutil
 import zmq
 
-from ccatp.daemon.process import die_with_parent
+from ccatp.daemon.supervision.process import die_with_parent
 from ccatp.links.bus import Subscriber
 from ccatp.links.channels import format_request
 from ccatp.links.rpc import RequestFailed, request
@@ -166,7 +166,7 @@ class Mission:
             command = process.info["cmdline"] or ()
             if str(self._run_dir) not in command:
                 continue
-            names = [name for name in PROCESSES if f"ccatp.daemon.{MODULES.get(name, name)}" in command]
+            names = [name for name in PROCESSES if MODULES.get(name) in command]
             is_ours = names and process.info["ppid"] == self._supervisor.pid
             is_supervisor = process.pid == self._supervisor.pid
             found["supervisor" if is_supervisor else names[0] if is_ours else str(process.pid)] = process

@@ -28,8 +28,8 @@ from playwright.sync_api import CDPSession, Page, sync_playwright
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.daemon.dashboard import serve_page
-from ccatp.daemon.process import Endpoints
+from ccatp.daemon.operator.dashboard import serve_page
+from ccatp.daemon.supervision.process import Endpoints
 from ccatp.links.bus import Publisher
 from ccatp.links.topics import FixMessage, Heartbeat, TrackMessage, TruthMessage
 from ccatp.report.dashboard.access import make_token

@@ -25,7 +25,7 @@ import zmq
 
 from ccatp.cli import main
 from ccatp.config.load import load_config
-from ccatp.daemon.streaming import streamed_schemas
+from ccatp.daemon.operator.streaming import streamed_schemas
 from ccatp.errors import RefusedError
 from ccatp.links.bus import Subscriber
 from ccatp.links.client import HttpClient, OperatorClient

@@ -69,7 +69,7 @@ def network(crossbar: str, folder: Path, port: int, *arguments: str) -> Iterator
     environment = {**os.environ, "CROSSBAR_DISABLE_VERSION_CHECK": "1"}
     environment.pop("PYTHONPATH", None)  # it has an environment of its own
     options = ["--site-file", str(folder / "sites.yaml"), "--site-host", "localhost"]
-    agent = [sys.executable, "-m", "ccatp.daemon.ocs_agent", *options, "--instance-id", INSTANCE, *arguments]
+    agent = [sys.executable, "-m", "ccatp.daemon.operator.ocs_agent", *options, "--instance-id", INSTANCE, *arguments]
 
     def listens() -> bool:
         assert router.poll() is None, "the crossbar router ended early"

@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from ccatp.daemon.run_dir import CHILDREN_LOCK
+from ccatp.daemon.supervision.run_dir import CHILDREN_LOCK
 from tests.faults.linking import Measured
 from tests.processes.conftest import Start
 from tests.support.runs import Run, wall_s

@@ -21,7 +21,7 @@ import zmq
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, PanelId, Twist
-from ccatp.daemon.process import Endpoints
+from ccatp.daemon.supervision.process import Endpoints
 from ccatp.kinematics import twist_of, wheel_rates
 from ccatp.links.bus import Publisher, Subscriber
 from ccatp.links.robot_link import RobotLink
@@ -133,8 +133,10 @@ def processes(cfg: Config, case: RimCase, run_dir: Path, endpoints: Endpoints) -
         common += ["--realtime"] if case.is_realtime else []
         python = [sys.executable, "-m"]
         started = [
-            subprocess.Popen([*python, "ccatp.daemon.sim_robot", *common, "--listen-fd", str(fd)], pass_fds=(fd,)),
-            subprocess.Popen([*python, "ccatp.daemon.danger_loop", *common]),
+            subprocess.Popen(
+                [*python, "ccatp.daemon.loops.sim_robot", *common, "--listen-fd", str(fd)], pass_fds=(fd,)
+            ),
+            subprocess.Popen([*python, "ccatp.daemon.loops.danger_loop", *common]),
         ]
         try:
             yield port

@@ -71,7 +71,7 @@ def test_four_processes_beside_the_supervisor_and_two_interrupts_end_as_one(star
     run = start("--panels", "9")
     run.until(lambda status: status["done"] >= 1)
     children = [" ".join(child.cmdline()) for child in psutil.Process(run.process.pid).children()]
-    modules = {line.split("ccatp.daemon.")[1].split()[0] for line in children}
+    modules = {line.split("ccatp.daemon.loops.")[1].split()[0] for line in children}
     assert modules == {"sim_robot", "sim_etalon", "danger_loop", "main_loop"}
     run.process.send_signal(signal.SIGINT)
     run.process.send_signal(signal.SIGINT)
@@ -364,7 +364,10 @@ print(json.dumps([status, [name for name in {HEAVY!r} if name in sys.modules]]))
     assert not result.stderr
 
 
-@pytest.mark.parametrize("process", ["supervisor", "danger_loop", "dashboard", "sim_robot", "sim_etalon"])
+@pytest.mark.parametrize(
+    "process",
+    ["supervision.supervisor", "loops.danger_loop", "operator.dashboard", "loops.sim_robot", "loops.sim_etalon"],
+)
 def test_only_the_main_loop_imports_scipy(process: str) -> None:
     """It takes a fifth of a second of each start, and of each restart of the process that watches the rim."""
     code = f"import sys, ccatp.daemon.{process}; print('scipy' in sys.modules)"

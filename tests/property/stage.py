@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from ccatp.config.models import Config
 from ccatp.control.gate import FanGate, Purpose
 from ccatp.core import Cause, EdgeSample, EventCode, PointId, Stop, Twist, Verdict, WheelSample
-from ccatp.daemon.mission_runner import STILL, TimedFrame
+from ccatp.daemon.loops.mission_runner import STILL, TimedFrame
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixRefused
 from ccatp.kinematics import twist_of

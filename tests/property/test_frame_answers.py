@@ -144,7 +144,7 @@ def callers(name: str) -> Iterator[str]:
 
 
 def test_permits_and_judged_frames_are_made_in_one_place() -> None:
-    assert list(callers("send_permit")) == ["daemon/danger_loop.py"]
+    assert list(callers("send_permit")) == ["daemon/loops/danger_loop.py"]
     assert list(callers("JudgedFrame")) == ["links/frame_answers.py"]
     assert [path for path in callers("Permit") if not path.startswith("commissioning/")] == ["links/frame_answers.py"]
 

@@ -19,9 +19,9 @@ import zmq
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
 from ccatp.core import PanelPose
-from ccatp.daemon.danger_loop import DangerLoop
-from ccatp.daemon.main_loop import MainLoop, open_runner
-from ccatp.daemon.process import Endpoints, ProcessArgs
+from ccatp.daemon.loops.danger_loop import DangerLoop
+from ccatp.daemon.loops.main_loop import MainLoop, open_runner
+from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role, Sensors
 from ccatp.localizer import Localizer, build_localizer
@@ -145,7 +145,7 @@ def _logging_to(entries: list[dict[str, Any]]) -> Iterator[None]:
         raise structlog.DropEvent
 
     logger = structlog.wrap_logger(None, processors=[structlog.processors.add_log_level, keep])
-    with patch("ccatp.daemon.robot_loop.open_log", lambda _, name: logger.bind(logger=name)):
+    with patch("ccatp.daemon.loops.robot_loop.open_log", lambda _, name: logger.bind(logger=name)):
         yield
 
 

@@ -19,13 +19,14 @@ import psutil
 import pytest
 
 from ccatp.config.load import load_config
+from ccatp.daemon.supervision.supervisor import PROCESSES
 from ccatp.links.channels import format_request
 from ccatp.links.rpc import RequestFailed, request
 
 # The calibration drive takes as long as a panel: it is done only where it matters.
 NO_CALIBRATION = ("--set", "mission.calibration_length_m=0")
 FREE_PORTS = ("--set", "sim.robot.port=0", "--set", "sim.etalon.port=0", "--set", "dashboard.enabled=false")
-MODULES = {"main": "main_loop", "danger": "danger_loop", "etalon": "sim_etalon", "dataloop": "sim_robot"}
+MODULES = {process.name: process.module for process in PROCESSES}
 DEADLINE_S = 60.0
 # Two panels in the world with slip and delays.
 RECORDED = ("--panels", "2", "--world", "hard", "--filter", "ekf", "--json", *NO_CALIBRATION)
@@ -97,7 +98,7 @@ class Run:
 
     def child(self, name: str, *, not_pid: int = 0) -> psutil.Process:
         """The process of that name in the process table, once it is there."""
-        module = f"ccatp.daemon.{MODULES.get(name, name)}"
+        module = MODULES[name]
         deadline_s = time.monotonic() + DEADLINE_S
         while time.monotonic() < deadline_s:
             assert self.process.poll() is None, "the run has ended"

@@ -18,7 +18,7 @@ from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import DeckPose, Fix, PointId, Severity, Vector3, Verdict
-from ccatp.daemon.fix_service import FixRequest, FixService
+from ccatp.daemon.loops.fix_service import FixRequest, FixService
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry

@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from ccatp.config import models
 from ccatp.config.load import DEFAULT_FILE, Overrides, layers, load_config, merged, validated
 from ccatp.core import NO_CAUSE, Verdict
-from ccatp.daemon import mission_runner
-from ccatp.daemon.mission_runner import STILL, DriveCommand, TimedFrame
+from ccatp.daemon.loops import mission_runner
+from ccatp.daemon.loops.mission_runner import STILL, DriveCommand, TimedFrame
 from ccatp.dataloop import StandIn, StandInOptions, survey_stand_in
 from ccatp.links import topics
 from ccatp.links.bus import Telemetry

@@ -17,7 +17,7 @@ from ccatp.cli import cli, main
 from ccatp.cli.common import configured_folder, parse_setting
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
-from ccatp.daemon.run_dir import RunOptions
+from ccatp.daemon.supervision.run_dir import RunOptions
 from ccatp.errors import ConfigError, DaemonUnreachableError, RefusedError
 from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
 from tests.support.command import answered, printed, refused
@@ -98,7 +98,7 @@ def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_run_hands_over_what_was_asked_for_and_nothing_else(stub: Stub, tmp_path: Path) -> None:
-    calls = stub("ccatp.daemon.supervisor", "run", 3)
+    calls = stub("ccatp.daemon.supervision.supervisor", "run", 3)
     argv = "run --sim --mirror fyst-m2 --world thesis-x2 --filter kf --panels 4 --seed 2 --realtime --json"
     more = ["--run-dir", str(tmp_path), "--runtime-dir", "/run/x", "--set", "limits.v_max_m_s=0.05"]
     assert main([*argv.split(), *more]) == 3
@@ -114,7 +114,7 @@ def test_run_hands_over_what_was_asked_for_and_nothing_else(stub: Stub, tmp_path
 
 
 def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> None:
-    calls = stub("ccatp.daemon.supervisor", "run", 0)
+    calls = stub("ccatp.daemon.supervision.supervisor", "run", 0)
     assert main(["run", "--sim", "--resume", "--run-dir", "runs/a"]) == 0
     (options,) = calls[0]
     assert (options.config_file, options.run_dir, options.resume) == (Path("runs/a/config.toml"), Path("runs/a"), True)
@@ -132,7 +132,7 @@ def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> N
 def test_expected_errors_are_one_line_and_their_exit_status(
     error: BaseException, status: int, line: str, stub: Stub, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stub("ccatp.daemon.supervisor", "run", error)
+    stub("ccatp.daemon.supervision.supervisor", "run", error)
     assert main(["run", "--sim"]) == status
     assert capsys.readouterr().err.lstrip("\n") == line
 
@@ -222,7 +222,7 @@ def test_an_emergency_that_is_not_in_force_is_no_success(
 
 
 def test_the_robot_alone_gets_its_address(stub: Stub) -> None:
-    calls = stub("ccatp.daemon.sim_robot", "run_alone", 0)
+    calls = stub("ccatp.daemon.loops.sim_robot", "run_alone", 0)
     argv = "sim robot --host 0.0.0.0 --port 0 --mirror fyst-m2 --seed 4 --lockstep --set sim.open_to_network=true"
     assert main(argv.split()) == main(["sim", "robot"]) == 0
     (cfg, options), (_, usual) = calls
@@ -271,7 +271,7 @@ def test_a_daemon_that_is_gone_is_reported_at_once(runtime_dir: Path, capsys: py
 
 
 def test_the_laser_system_alone_gets_its_puck(stub: Stub, tmp_path: Path) -> None:
-    calls = stub("ccatp.daemon.sim_etalon", "run_alone", 0)
+    calls = stub("ccatp.daemon.loops.sim_etalon", "run_alone", 0)
     argv = "sim etalon --port 2002 --puck 0.1 -0.5 3.4 --set etalon.retries=1"
     assert main(argv.split()) == main(["sim", "etalon", "--runtime-dir", str(tmp_path)]) == 0
     (cfg, *where), (_, *of_robot) = calls

@@ -17,8 +17,8 @@ from ccatp.conditions import WHEEL_BLOCKED
 from ccatp.config.load import available, load_config
 from ccatp.config.package import child_environment
 from ccatp.core import Severity
-from ccatp.daemon.run_text import clock
-from ccatp.daemon.terminal import status_line, status_rows
+from ccatp.daemon.operator.terminal import status_line, status_rows
+from ccatp.daemon.supervision.run_text import clock
 from ccatp.links.topics import MissionStatus
 from ccatp.survey.composition import assemble
 from ccatp.survey.planning.search import leg_lengths

@@ -19,7 +19,7 @@ from autobahn.asyncio.websocket import WebSocketClientFactory, WebSocketClientPr
 from scipy.spatial.transform import Rotation
 
 from ccatp.core import PanelId, PanelPose, PointId
-from ccatp.daemon.streaming import RUN, serve, streamed_schemas
+from ccatp.daemon.operator.streaming import RUN, serve, streamed_schemas
 from ccatp.links.topics import (
     FixMessage,
     LogMessage,

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 from ccatp.beacons.config.models import RadioConfig
-from ccatp.daemon.run_text import RunText, progress_text
-from ccatp.daemon.supervisor import WITHOUT_LASER
+from ccatp.daemon.supervision.run_text import RunText, progress_text
+from ccatp.daemon.supervision.supervisor import WITHOUT_LASER
 from ccatp.links.topics import MissionStatus
 
 # Positions come from radio. When main dies, its map is lost, and the run ends, held.

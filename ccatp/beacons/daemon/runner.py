@@ -17,8 +17,8 @@ from ccatp.beacons.records.store import BeaconStore
 from ccatp.beacons.steering import HALT
 from ccatp.conditions import text_of
 from ccatp.core import Verdict
-from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, LoopLimits, MissionRunner, TimedFrame
-from ccatp.daemon.process import ProcessArgs
+from ccatp.daemon.loops.mission_runner import EXIT_STATUS, STILL, DriveCommand, LoopLimits, MissionRunner, TimedFrame
+from ccatp.daemon.supervision.process import ProcessArgs
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Telemetry
 from ccatp.links.robot_codec import BadLine
@@ -27,7 +27,7 @@ from ccatp.links.topics import DisplayState, EstimateMessage, MissionStatus, Rob
 from ccatp.survey.events import DONE, HELD, IDLE, RETURNING, Fault
 
 if TYPE_CHECKING:
-    from ccatp.daemon.main_loop import MainLoop
+    from ccatp.daemon.loops.main_loop import MainLoop
 
 ECHO_MEMORY = 200  # number of recent echoes of the distance sensors, for displays
 TRAIL = 400  # number of places of the robot, one in five frames

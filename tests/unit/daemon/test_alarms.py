@@ -20,10 +20,10 @@ from ccatp import conditions
 from ccatp.conditions import text_of
 from ccatp.config.models import AlarmsConfig
 from ccatp.core import Cause, EmergencyKind, Severity
-from ccatp.daemon import alarms, webhook
-from ccatp.daemon.alarms import LEAST_S, ActiveCause, AlarmList, active_cause, read_history
-from ccatp.daemon.danger_loop import FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
-from ccatp.daemon.webhook import AlarmWebhook, changes
+from ccatp.daemon.loops.danger_loop import FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
+from ccatp.daemon.operator import alarms, webhook
+from ccatp.daemon.operator.alarms import LEAST_S, ActiveCause, AlarmList, active_cause, read_history
+from ccatp.daemon.operator.webhook import AlarmWebhook, changes
 from ccatp.links.topics import Alarm, MissionStatus
 from ccatp.safety.emergency_latch import cause_of
 from tests.support.daemon import configuration, running_daemon

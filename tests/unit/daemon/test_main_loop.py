@@ -14,10 +14,10 @@ import zmq
 
 from ccatp.beacons.modes import BeaconMode
 from ccatp.config.load import load_config
-from ccatp.daemon.main_loop import STANDS_REPORT_S, MainLoop
-from ccatp.daemon.mission_runner import MissionRunner
-from ccatp.daemon.process import Endpoints, ProcessArgs
-from ccatp.daemon.terminal import next_text, status_rows
+from ccatp.daemon.loops.main_loop import STANDS_REPORT_S, MainLoop
+from ccatp.daemon.loops.mission_runner import MissionRunner
+from ccatp.daemon.operator.terminal import next_text, status_rows
+from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import MissionStatus
 from ccatp.survey.events import WAITS_FOR, MissionState, waits_for

@@ -11,8 +11,8 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from ccatp.daemon import ocs_agent
-from ccatp.daemon.ocs_agent import SurveyTask, add_arguments, main, register, survey_command
+from ccatp.daemon.operator import ocs_agent
+from ccatp.daemon.operator.ocs_agent import SurveyTask, add_arguments, main, register, survey_command
 from ccatp.errors import ConfigError
 from ccatp.links.client import OperatorClient
 from tests.unit.test_keys import serving, status
@@ -31,7 +31,7 @@ class Session:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.daemon.ocs_agent.PERIOD_S", 0.01)
+    monkeypatch.setattr("ccatp.daemon.operator.ocs_agent.PERIOD_S", 0.01)
 
 
 def surveys_of(runtime_dir: Path, program: str = "") -> SurveyTask:
@@ -61,7 +61,7 @@ def test_a_survey_ends_as_its_process_does(
 
 
 def test_a_survey_that_reports_nothing_is_ended(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.daemon.ocs_agent.START_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("ccatp.daemon.operator.ocs_agent.START_TIMEOUT_S", 0.2)
     done, text = surveys_of(runtime_dir, "import time; time.sleep(60)").survey(Session())
     assert not done
     assert "said nothing within 0.2 s" in text
@@ -158,5 +158,5 @@ def test_without_the_extra_it_reports_it(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_the_plugin_names_the_agent() -> None:
     project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
-    assert project["entry-points"]["ocs.plugins"] == {"ccatp": "ccatp.daemon.ocs_agent"}
-    assert ocs_agent.agents["CcatpAgent"] == {"module": "ccatp.daemon.ocs_agent", "entry_point": "main"}
+    assert project["entry-points"]["ocs.plugins"] == {"ccatp": "ccatp.daemon.operator.ocs_agent"}
+    assert ocs_agent.agents["CcatpAgent"] == {"module": "ccatp.daemon.operator.ocs_agent", "entry_point": "main"}

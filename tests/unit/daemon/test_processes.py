@@ -16,7 +16,7 @@ import zmq
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
-from ccatp.daemon.child_processes import (
+from ccatp.daemon.supervision.child_processes import (
     ProcessEnd,
     ProcessManager,
     ProcessSpec,
@@ -25,9 +25,9 @@ from ccatp.daemon.child_processes import (
     open_page_socket,
     page_url,
 )
-from ccatp.daemon.collector import Collector
-from ccatp.daemon.process import Endpoints, parse_args, unless_stopped
-from ccatp.daemon.survey_record import SurveyRecord
+from ccatp.daemon.supervision.collector import Collector
+from ccatp.daemon.supervision.process import Endpoints, parse_args, unless_stopped
+from ccatp.daemon.supervision.survey_record import SurveyRecord
 from ccatp.errors import DaemonUnreachableError
 from ccatp.links.bus import HeartbeatPublisher, Publisher
 from ccatp.links.topics import Heartbeat, MissionStatus
@@ -133,12 +133,12 @@ def test_niceness_and_the_time_of_the_last_process(
     children: ProcessManager, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STATUS", "0")
-    monkeypatch.setattr("ccatp.daemon.child_processes.STOP_TIMEOUT_S", 0.0)  # others have used it up
-    monkeypatch.setattr("ccatp.daemon.child_processes.LEAST_STOP_S", 30.0)
+    monkeypatch.setattr("ccatp.daemon.supervision.child_processes.STOP_TIMEOUT_S", 0.0)  # others have used it up
+    monkeypatch.setattr("ccatp.daemon.supervision.child_processes.LEAST_STOP_S", 30.0)
     own = os.getpriority(os.PRIO_PROCESS, 0)
     # What starts later has the same, though the supervisor has stepped back.
     with monkeypatch.context() as patch:
-        patch.setattr("ccatp.daemon.child_processes.os.getpriority", lambda *_: 19)
+        patch.setattr("ccatp.daemon.supervision.child_processes.os.getpriority", lambda *_: 19)
         children.start(PAGE)
     (found,) = children._children.values()
     assert os.getpriority(os.PRIO_PROCESS, found.process.pid) == min(own + 7, 19)
@@ -157,8 +157,8 @@ def test_niceness_and_the_time_of_the_last_process(
 def test_who_does_not_stop_is_killed(
     children: ProcessManager, said: list[str], monkeypatch: pytest.MonkeyPatch, spec: ProcessSpec, lines: list[str]
 ) -> None:
-    monkeypatch.setattr("ccatp.daemon.child_processes.STOP_TIMEOUT_S", 0.0)
-    monkeypatch.setattr("ccatp.daemon.child_processes.LEAST_STOP_S", 0.2)
+    monkeypatch.setattr("ccatp.daemon.supervision.child_processes.STOP_TIMEOUT_S", 0.0)
+    monkeypatch.setattr("ccatp.daemon.supervision.child_processes.LEAST_STOP_S", 0.2)
     children.start(spec)
     (found,) = children._children.values()
     status = Path(f"/proc/{found.process.pid}/status")
@@ -174,7 +174,7 @@ def test_servers_stop_together(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr("ccatp.daemon.child_processes.STOP_TIMEOUT_S", 30.0)
+    monkeypatch.setattr("ccatp.daemon.supervision.child_processes.STOP_TIMEOUT_S", 30.0)
     Path("together.py").write_text(TOGETHER)
     children = ProcessManager(config.run, lambda spec, _: ([spec.name], ()), lambda _level, text: said.append(text))
     for name in ("one", "two"):
@@ -288,7 +288,7 @@ def test_an_address_that_cannot_be_had_is_no_end_of_a_survey(config: Config, mon
     def refuse(_host: str, _port: int) -> socket.socket:
         raise OSError(98, "Address already in use")
 
-    monkeypatch.setattr("ccatp.daemon.child_processes.listen_at", refuse)
+    monkeypatch.setattr("ccatp.daemon.supervision.child_processes.listen_at", refuse)
     for page, why in (
         (elsewhere, "192.0.2.1:7080: Cannot assign requested address; choose another dashboard.host"),
         (open_page_socket(config.dashboard), "127.0.0.1:7080: Address already in use; choose another dashboard.host"),

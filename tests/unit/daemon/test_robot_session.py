@@ -15,8 +15,8 @@ from ccatp.conditions import LASER_NOT_READY
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
-from ccatp.daemon.fix_service import FixRequest
-from ccatp.daemon.robot_session import (
+from ccatp.daemon.loops.fix_service import FixRequest
+from ccatp.daemon.loops.robot_session import (
     FIRST_DELAY_S,
     LONGEST_DELAY_S,
     FrameAge,
@@ -348,7 +348,7 @@ async def test_a_point_that_is_measured_already_is_done_and_needs_no_operator(co
 async def test_a_laser_that_is_not_ready_is_waited_for_and_reported_once(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ccatp.daemon.fix_service.LASER_PERIOD_S", 0.0)
+    monkeypatch.setattr("ccatp.daemon.loops.fix_service.LASER_PERIOD_S", 0.0)
     reported, levels = await measured_once(config, [], None, None, lambda _event: None, not_ready=3)
     assert [fix.is_fused for fix in reported] == [True]
     assert levels == [f"measurement of the robot's place waits: {LASER_NOT_READY.message}"]

@@ -16,9 +16,9 @@ from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.daemon.run import PROCESSES as BEACON_PROCESSES
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.daemon.danger_loop import FILE as EMERGENCIES
-from ccatp.daemon.process import run_dir_in
-from ccatp.daemon.run_dir import (
+from ccatp.daemon.loops.danger_loop import FILE as EMERGENCIES
+from ccatp.daemon.supervision.process import run_dir_in
+from ccatp.daemon.supervision.run_dir import (
     FILE,
     RunOptions,
     await_predecessors,
@@ -36,7 +36,7 @@ from ccatp.daemon.run_dir import (
     take_runtime_dir,
     with_origin,
 )
-from ccatp.daemon.supervisor import PROCESSES, run
+from ccatp.daemon.supervision.supervisor import PROCESSES, run
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import (
     LOCK_FILE,
@@ -152,13 +152,15 @@ def test_a_survey_is_resumed_with_its_own_points(
 
 
 def test_runs_of_one_second_have_directories_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.daemon.run_dir.default_run_dir", lambda *_: Path("runs/same"))
+    monkeypatch.setattr("ccatp.daemon.supervision.run_dir.default_run_dir", lambda *_: Path("runs/same"))
     made = []
     for _ in range(3):
         made.append(make_run_dir(options(), load_config()))
         (made[-1] / "mission.sqlite").touch()
     assert [path.name for path in made] == ["same", "same-2", "same-3"]
-    monkeypatch.setattr("ccatp.daemon.run_dir.default_run_dir", lambda *_: Path("runs/same/mission.sqlite/x"))
+    monkeypatch.setattr(
+        "ccatp.daemon.supervision.run_dir.default_run_dir", lambda *_: Path("runs/same/mission.sqlite/x")
+    )
     with pytest.raises(ConfigError, match=r"--run-dir: cannot make .*; name another folder"):
         make_run_dir(options(), load_config())
 
@@ -238,7 +240,7 @@ def test_a_service_continues_with_the_run_that_did_not_finish(monkeypatch: pytes
         (wanted.run_dir / "mission.sqlite").touch()
         return 4 if len(asked) == 1 else 0
 
-    monkeypatch.setattr("ccatp.daemon.supervisor._run", run_once)
+    monkeypatch.setattr("ccatp.daemon.supervision.supervisor._run", run_once)
     assert [run(options(recover=True)) for _ in range(3)] == [4, 0, 0]
     assert [(one.resume, one.held) for one in asked] == [(False, False), (True, True), (False, False)]
     assert asked[1].run_dir == asked[0].run_dir
@@ -317,7 +319,7 @@ def test_a_daemon_waits_for_the_children_of_the_one_before(tmp_path: Path, monke
     with ExitStack() as stack:
         locks = await_predecessors(stack, tmp_path)
         child = subprocess.Popen(["cat"], stdin=subprocess.PIPE, pass_fds=locks)
-    monkeypatch.setattr("ccatp.daemon.run_dir.PREDECESSORS_S", 0.0)
+    monkeypatch.setattr("ccatp.daemon.supervision.run_dir.PREDECESSORS_S", 0.0)
     with child, ExitStack() as stack:
         with pytest.raises(RefusedError, match="processes of an earlier run still use"):
             await_predecessors(stack, tmp_path)

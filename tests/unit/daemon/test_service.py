@@ -17,7 +17,7 @@ import structlog
 from structlog.testing import capture_logs
 
 from ccatp.config.load import load_config
-from ccatp.daemon.supervisor import Service
+from ccatp.daemon.supervision.supervisor import Service
 from ccatp.links import realtime
 from ccatp.links.liveness import Liveness
 from ccatp.links.service_manager import Notifier, is_journal, take_from

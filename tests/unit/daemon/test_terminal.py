@@ -8,9 +8,9 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.beacons.config.load import load_radio_config
-from ccatp.daemon.process import open_log
-from ccatp.daemon.survey_runner import state_text
-from ccatp.daemon.terminal import RunView, write_run_report
+from ccatp.daemon.loops.survey_runner import state_text
+from ccatp.daemon.operator.terminal import RunView, write_run_report
+from ccatp.daemon.supervision.process import open_log
 from ccatp.errors import ExitStatus
 from ccatp.links.liveness import RateLimitedLog, kind_of
 from ccatp.links.topics import DangerEvent, LogMessage, MissionStatus, TrackMessage

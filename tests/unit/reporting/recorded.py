@@ -14,7 +14,7 @@ from ccatp.conditions import text_of
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, Measured, PanelId, PointId
-from ccatp.daemon.mission_runner import TimedFrame
+from ccatp.daemon.loops.mission_runner import TimedFrame
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import (

@@ -10,7 +10,7 @@ from ccatp.beacons.conditions import GROUP as BEACONS
 from ccatp.conditions import TABLE, Action, Clear, Condition, Motion
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
-from ccatp.daemon.alarms import active_cause
+from ccatp.daemon.operator.alarms import active_cause
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety import edge_detector, emergency_latch
 from ccatp.safety.emergency_latch import EmergencyLatch

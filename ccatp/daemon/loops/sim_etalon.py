@@ -9,8 +9,8 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.core import Vector3
-from ccatp.daemon.child_processes import listen
-from ccatp.daemon.process import FAULTS_FILE, run_until_stopped, start_process
+from ccatp.daemon.supervision.child_processes import listen
+from ccatp.daemon.supervision.process import FAULTS_FILE, run_until_stopped, start_process
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck, ZmqPuck
 from ccatp.sim.fault_plan import FaultPlan, InjectedFault, read_plan
@@ -42,7 +42,7 @@ def _run(
 
 
 def main() -> int:
-    """Entry of ``python -m ccatp.daemon.sim_etalon``."""
+    """Entry of ``python -m ccatp.daemon.loops.sim_etalon``."""
     args = start_process()
     cfg = cast(Config, args.config)  # only the process table of a survey has this process
     plan = read_plan(args.run_dir / FAULTS_FILE, lockstep=not args.is_realtime) if args.has_faults else FaultPlan()

@@ -133,7 +133,7 @@ class SurveyTask:
 AGENT_CLASS = "CcatpAgent"
 # Names that OCS reads from the module of the entry point ``ocs.plugins``.
 package_name = "ccatp"
-agents = {AGENT_CLASS: {"module": "ccatp.daemon.ocs_agent", "entry_point": "main"}}
+agents = {AGENT_CLASS: {"module": "ccatp.daemon.operator.ocs_agent", "entry_point": "main"}}
 FEED = "survey"
 ORDERS = ("status", "pause", "resume", "abort", "stop")
 # A pause is answered when the robot is at rest.

@@ -18,8 +18,10 @@ import zmq
 from ccatp.config.files import read_toml, write_durably
 from ccatp.config.load import dump_config, load_config, load_mission
 from ccatp.config.mission import MissionConfig
-from ccatp.daemon.alarms import AlarmList
-from ccatp.daemon.child_processes import (
+from ccatp.daemon.operator.alarms import AlarmList
+from ccatp.daemon.operator.terminal import STOP_SIGNALS, RunView, write_run_report
+from ccatp.daemon.operator.webhook import AlarmWebhook
+from ccatp.daemon.supervision.child_processes import (
     PageSocket,
     ProcessEnd,
     ProcessManager,
@@ -31,10 +33,10 @@ from ccatp.daemon.child_processes import (
     token_query,
     with_addresses,
 )
-from ccatp.daemon.collector import Collector
-from ccatp.daemon.named_files import check_named_files
-from ccatp.daemon.process import ADDRESSES_FILE, FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
-from ccatp.daemon.run_dir import (
+from ccatp.daemon.supervision.collector import Collector
+from ccatp.daemon.supervision.named_files import check_named_files
+from ccatp.daemon.supervision.process import ADDRESSES_FILE, FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
+from ccatp.daemon.supervision.run_dir import (
     RunOptions,
     await_predecessors,
     check_takes_faults,
@@ -46,9 +48,7 @@ from ccatp.daemon.run_dir import (
     take_runtime_dir,
     with_origin,
 )
-from ccatp.daemon.run_text import RunText
-from ccatp.daemon.terminal import STOP_SIGNALS, RunView, write_run_report
-from ccatp.daemon.webhook import AlarmWebhook
+from ccatp.daemon.supervision.run_text import RunText
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.liveness import STALE_AFTER_S, Liveness
 from ccatp.links.service_manager import Notifier, is_journal, take_from
@@ -75,17 +75,19 @@ PROCESSES: tuple[ProcessSpec, ...] = (
     # First, so that it shows the end of the others. It has the lowest priority, so it may be silent for a minute.
     ProcessSpec(
         "dashboard",
-        "ccatp.daemon.dashboard",
+        "ccatp.daemon.operator.dashboard",
         listens="dashboard",
         is_loop=True,
         is_needed=False,
         niceness=15,
         hang_timeout_s=60.0,
     ),
-    ProcessSpec("dataloop", "ccatp.daemon.sim_robot", is_simulator=True, listens="sim.robot", is_replaceable=False),
-    ProcessSpec("etalon", "ccatp.daemon.sim_etalon", is_simulator=True, listens="sim.etalon"),
-    ProcessSpec("danger", "ccatp.daemon.danger_loop", is_loop=True),
-    ProcessSpec("main", "ccatp.daemon.main_loop", is_loop=True),
+    ProcessSpec(
+        "dataloop", "ccatp.daemon.loops.sim_robot", is_simulator=True, listens="sim.robot", is_replaceable=False
+    ),
+    ProcessSpec("etalon", "ccatp.daemon.loops.sim_etalon", is_simulator=True, listens="sim.etalon"),
+    ProcessSpec("danger", "ccatp.daemon.loops.danger_loop", is_loop=True),
+    ProcessSpec("main", "ccatp.daemon.loops.main_loop", is_loop=True),
 )
 # Of a mission without a laser system.
 WITHOUT_LASER = tuple(spec for spec in PROCESSES if spec.name != "etalon")

@@ -14,8 +14,8 @@ from uuid import uuid4
 
 from ccatp.config.files import read_input, read_text, write_durably
 from ccatp.config.mission import MissionConfig
-from ccatp.daemon.danger_loop import FILE as EMERGENCIES
-from ccatp.daemon.run_text import RunText
+from ccatp.daemon.loops.danger_loop import FILE as EMERGENCIES
+from ccatp.daemon.supervision.run_text import RunText
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import BESIDE, LOCK_FILE, TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.missions import MissionKind, kind_of

@@ -20,10 +20,10 @@ import zmq
 from ccatp.conditions import text_of
 from ccatp.config.files import read_text, sync_folder
 from ccatp.core import NO_CAUSE, Cause, EmergencyKind, EventCode, Severity, Verdict
-from ccatp.daemon.alarms import ActiveCause, active_cause
-from ccatp.daemon.command_handlers import ObservatoryServer
-from ccatp.daemon.process import ProcessArgs, run_process, start_process
-from ccatp.daemon.robot_loop import RobotLoop
+from ccatp.daemon.loops.robot_loop import RobotLoop
+from ccatp.daemon.operator.alarms import ActiveCause, active_cause
+from ccatp.daemon.operator.command_handlers import ObservatoryServer
+from ccatp.daemon.supervision.process import ProcessArgs, run_process, start_process
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import EstimateSubscriber
 from ccatp.links.frame_answers import PermitRule
@@ -250,7 +250,7 @@ class DangerLoop(RobotLoop):
 
 
 def main() -> int:
-    """Entry of ``python -m ccatp.daemon.danger_loop``."""
+    """Entry of ``python -m ccatp.daemon.loops.danger_loop``."""
     args = start_process()
 
     async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:

@@ -12,11 +12,11 @@ from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
 from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import NO_CAUSE, Cause, Verdict
-from ccatp.daemon.checkpoints import build_parts
-from ccatp.daemon.fix_service import FixRequest, FixService
-from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
-from ccatp.daemon.process import ProcessArgs
-from ccatp.daemon.run_dir import read_run_id
+from ccatp.daemon.loops.checkpoints import build_parts
+from ccatp.daemon.loops.fix_service import FixRequest, FixService
+from ccatp.daemon.loops.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
+from ccatp.daemon.supervision.process import ProcessArgs
+from ccatp.daemon.supervision.run_dir import read_run_id
 from ccatp.errors import DaemonUnreachableError, ExitStatus
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry
@@ -47,7 +47,7 @@ from ccatp.survey.state import SurveyState, by_reason
 from ccatp.survey.statechart import Mission
 
 if TYPE_CHECKING:
-    from ccatp.daemon.main_loop import MainLoop
+    from ccatp.daemon.loops.main_loop import MainLoop
 
 
 # Period of the checkpoint in frames, ten per second.

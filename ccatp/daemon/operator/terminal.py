@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from ccatp.conditions import danger_text, find_condition
 from ccatp.config.mission import MissionConfig
 from ccatp.core import Severity
-from ccatp.daemon.run_text import RunText, clock
+from ccatp.daemon.supervision.run_text import RunText, clock
 from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage

@@ -9,8 +9,8 @@ from pathlib import Path
 import structlog
 
 from ccatp.config.mission import MissionConfig
-from ccatp.daemon.child_processes import listen
-from ccatp.daemon.process import FAULTS_FILE, Endpoints, open_log, run_until_stopped, start_process
+from ccatp.daemon.supervision.child_processes import listen
+from ccatp.daemon.supervision.process import FAULTS_FILE, Endpoints, open_log, run_until_stopped, start_process
 from ccatp.dataloop import serve
 from ccatp.errors import ExitStatus
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
@@ -20,7 +20,7 @@ from ccatp.sim.ground_truth import FILE
 
 
 def main() -> int:
-    """Entry of ``python -m ccatp.daemon.sim_robot``."""
+    """Entry of ``python -m ccatp.daemon.loops.sim_robot``."""
     args = start_process()
     cfg, lockstep = args.config, not args.is_realtime
     plan = read_plan(args.run_dir / FAULTS_FILE, lockstep=lockstep) if args.has_faults else None

@@ -11,9 +11,9 @@ import zmq
 import ccatp
 from ccatp.config.load import dump_config
 from ccatp.config.mission import MissionConfig
-from ccatp.daemon.process import Endpoints
-from ccatp.daemon.run_text import RunText
-from ccatp.daemon.terminal import RunView
+from ccatp.daemon.operator.terminal import RunView
+from ccatp.daemon.supervision.process import Endpoints
+from ccatp.daemon.supervision.run_text import RunText
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Subscriber
 from ccatp.links.topics import Heartbeat, Message, MissionStatus, Timing, TruthBatch, topics_of

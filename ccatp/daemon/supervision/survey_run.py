@@ -5,9 +5,9 @@ from pathlib import Path
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.daemon.mission_runner import LoopLimits
-from ccatp.daemon.run_dir import RunOptions
-from ccatp.daemon.run_text import RunText, clock, progress_text
+from ccatp.daemon.loops.mission_runner import LoopLimits
+from ccatp.daemon.supervision.run_dir import RunOptions
+from ccatp.daemon.supervision.run_text import RunText, clock, progress_text
 from ccatp.errors import ConfigError
 from ccatp.links.topics import MissionStatus
 

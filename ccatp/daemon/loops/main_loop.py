@@ -23,11 +23,11 @@ from ccatp.conditions import (
     text_of,
 )
 from ccatp.core import Severity, Verdict
-from ccatp.daemon.alarms import ActiveCause, AlarmList, active_cause
-from ccatp.daemon.mission_runner import STILL, DriveCommand, LoopLimits, MissionRunner, TimedFrame
-from ccatp.daemon.process import ProcessArgs, run_process, start_process
-from ccatp.daemon.robot_loop import WAIT_PERIOD_S, RobotLoop
-from ccatp.daemon.robot_session import FrameAge
+from ccatp.daemon.loops.mission_runner import STILL, DriveCommand, LoopLimits, MissionRunner, TimedFrame
+from ccatp.daemon.loops.robot_loop import WAIT_PERIOD_S, RobotLoop
+from ccatp.daemon.loops.robot_session import FrameAge
+from ccatp.daemon.operator.alarms import ActiveCause, AlarmList, active_cause
+from ccatp.daemon.supervision.process import ProcessArgs, run_process, start_process
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 from ccatp.links.bus import BATCH_WALL_S, Subscriber, VerdictSubscriber
 from ccatp.links.channels import (
@@ -503,7 +503,7 @@ def open_runner(args: ProcessArgs) -> AbstractContextManager[Callable[[MainLoop]
 
 
 def main() -> int:
-    """Entry of ``python -m ccatp.daemon.main_loop``."""
+    """Entry of ``python -m ccatp.daemon.loops.main_loop``."""
     args = start_process()
 
     async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:

@@ -15,7 +15,7 @@ import msgspec
 import zmq
 
 from ccatp.config.load import load_config
-from ccatp.daemon.process import RUN_DIR_FILE, Endpoints, run_dir_in
+from ccatp.daemon.supervision.process import RUN_DIR_FILE, Endpoints, run_dir_in
 from ccatp.errors import ConfigError
 from ccatp.links.bus import Subscriber
 from ccatp.links.runtime_dir import runtime_dir_path

@@ -18,7 +18,7 @@ from ccatp.config.load import load_mission
 from ccatp.config.mission import MissionConfig
 from ccatp.config.models import DashboardConfig, ProcessesConfig
 from ccatp.config.package import child_environment
-from ccatp.daemon.process import SUPERVISOR_PID, listen_at, run_dir_in
+from ccatp.daemon.supervision.process import SUPERVISOR_PID, listen_at, run_dir_in
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import Heartbeat
 from ccatp.missions import kind_of

@@ -18,9 +18,9 @@ import zmq
 
 from ccatp.config.load import load_mission
 from ccatp.config.mission import MissionConfig
-from ccatp.daemon.child_processes import open_page_socket, token_query
-from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
-from ccatp.daemon.process import Endpoints, open_log, run_dir_in, run_until_stopped, start_process
+from ccatp.daemon.operator.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
+from ccatp.daemon.supervision.child_processes import open_page_socket, token_query
+from ccatp.daemon.supervision.process import Endpoints, open_log, run_dir_in, run_until_stopped, start_process
 from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.bus import HeartbeatPublisher, Publisher
 from ccatp.links.liveness import LogRateLimit
@@ -130,7 +130,7 @@ class _Handler(logging.Handler):
 
 
 def main() -> int:
-    """Entry of ``python -m ccatp.daemon.dashboard``."""
+    """Entry of ``python -m ccatp.daemon.operator.dashboard``."""
     args = start_process()
     listener = socket.socket(fileno=args.listen_fd)
     places = args.run_dir, args.endpoints, listener

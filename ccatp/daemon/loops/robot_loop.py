@@ -10,8 +10,8 @@ from typing import Any
 import zmq
 import zmq.asyncio
 
-from ccatp.daemon.process import ProcessArgs, open_log, unless_stopped
-from ccatp.daemon.robot_session import LatenessStatistics, RobotSession
+from ccatp.daemon.loops.robot_session import LatenessStatistics, RobotSession
+from ccatp.daemon.supervision.process import ProcessArgs, open_log, unless_stopped
 from ccatp.links import realtime
 from ccatp.links.bus import PERIOD_S, HeartbeatPublisher, PeerSubscriber, Publisher
 from ccatp.links.robot_messages import Role

@@ -7,10 +7,10 @@ from msgspec.structs import replace
 from ccatp.conditions import RESTARTED
 from ccatp.config.models import Config
 from ccatp.core import Cause, PointId
-from ccatp.daemon.danger_loop import FILE as EMERGENCIES
-from ccatp.daemon.danger_loop import active_ids
-from ccatp.daemon.process import ProcessArgs
-from ccatp.daemon.run_dir import read_run_id
+from ccatp.daemon.loops.danger_loop import FILE as EMERGENCIES
+from ccatp.daemon.loops.danger_loop import active_ids
+from ccatp.daemon.supervision.process import ProcessArgs
+from ccatp.daemon.supervision.run_dir import read_run_id
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.checkpoint import AT_BASE, FILE, CheckpointError, read_checkpoint

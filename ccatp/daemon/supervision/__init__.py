@@ -1,0 +1,1 @@
+"""A run of processes: process table, children, run directory, locks, collected messages, records."""
