@@ -34,7 +34,7 @@ from ccatp.commissioning.preflight import (
 from ccatp.config.files import read_key
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.daemon.operator.command_handlers import check_observatory
+from ccatp.daemon.operator.observatory import check_observatory
 from ccatp.daemon.supervision.child_processes import (
     ProcessManager,
     ProcessSpec,

@@ -18,7 +18,7 @@ from zmq.utils.monitor import parse_monitor_message
 
 from ccatp.cli import main
 from ccatp.config.models import ObservatoryConfig
-from ccatp.daemon.operator.command_handlers import ObservatoryServer
+from ccatp.daemon.operator.observatory import ObservatoryServer
 from ccatp.danger import DangerMonitor
 from ccatp.errors import ConfigError
 from ccatp.links.auth import AuthorizedClient, KeyPair, read_pair, write_pair

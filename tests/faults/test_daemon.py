@@ -103,7 +103,7 @@ TASKS = (
     "ccatp.daemon.loops.fix_service.FixService.run",
     "ccatp.daemon.loops.robot_session.RobotSession.serve",
     "ccatp.daemon.loops.main_loop.MainLoop._serve_operator",
-    "ccatp.daemon.operator.command_handlers.ObservatoryServer.serve",
+    "ccatp.daemon.operator.observatory.ObservatoryServer.serve",
 )
 
 

@@ -22,7 +22,7 @@ from ccatp.config.files import read_text, sync_folder
 from ccatp.core import NO_CAUSE, Cause, EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.loops.robot_loop import RobotLoop
 from ccatp.daemon.operator.alarms import ActiveCause, active_cause
-from ccatp.daemon.operator.command_handlers import ObservatoryServer
+from ccatp.daemon.operator.observatory import ObservatoryServer
 from ccatp.daemon.supervision.process import ProcessArgs, run_process, start_process
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import EstimateSubscriber

@@ -18,7 +18,7 @@ import zmq
 
 from ccatp.config.load import load_mission
 from ccatp.config.mission import MissionConfig
-from ccatp.daemon.operator.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
+from ccatp.daemon.operator.observatory import LOGGED_LINES, LOGGED_PERIOD_S
 from ccatp.daemon.supervision.child_processes import open_page_socket, token_query
 from ccatp.daemon.supervision.process import Endpoints, open_log, run_dir_in, run_until_stopped, start_process
 from ccatp.errors import ConfigError, DaemonUnreachableError

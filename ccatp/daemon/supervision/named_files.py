@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ccatp.config.files import read_key
 from ccatp.config.mission import MissionConfig
-from ccatp.daemon.operator.command_handlers import CLIENTS_FILE, KEY_FILE
+from ccatp.daemon.operator.observatory import CLIENTS_FILE, KEY_FILE
 from ccatp.errors import ConfigError
 from ccatp.links.auth import read_clients, read_pair
 from ccatp.report.dashboard.access import read_tokens
