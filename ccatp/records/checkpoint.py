@@ -16,7 +16,7 @@ import msgspec
 from ccatp.config.files import read_input
 from ccatp.errors import UsageError
 
-FILE = "checkpoint"
+CHECKPOINT_FILE = "checkpoint"
 # Offset of the second slot. A longer record overwrites the older one, and is complete itself.
 _SLOT_BYTES = 65536
 _HEAD_BYTES = 8  # length and checksum of count and record

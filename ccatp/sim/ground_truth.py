@@ -157,7 +157,7 @@ class GroundTruthPublisher:
         self._context.destroy(linger=0)
 
 
-FILE = "robot"
+ROBOT_FILE = "robot"
 PERIOD_FRAMES = 10
 _POSE, _CRC = Struct("<3d"), Struct("<I")
 

@@ -7,13 +7,12 @@ from msgspec.structs import replace
 from ccatp.conditions import RESTARTED
 from ccatp.config.models import Config
 from ccatp.core import Cause, PointId
-from ccatp.daemon.loops.danger_loop import FILE as EMERGENCIES
-from ccatp.daemon.loops.danger_loop import active_ids
+from ccatp.daemon.loops.danger_loop import EMERGENCIES_FILE, active_ids
 from ccatp.daemon.supervision.process import ProcessArgs
 from ccatp.daemon.supervision.run_dir import read_run_id
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records.checkpoint import AT_BASE, FILE, CheckpointError, read_checkpoint
+from ccatp.records.checkpoint import AT_BASE, CHECKPOINT_FILE, CheckpointError, read_checkpoint
 from ccatp.records.store import MissionStore, StoredPoint, StoreError
 from ccatp.survey.composition import Checkpoint, SurveyParts, assemble, take_over
 from ccatp.survey.events import EmergencyKnown, Pause, TakenOver
@@ -35,10 +34,10 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
     except StoreError as error:
         raise StoreUnusable(str(error)) from error
     measured = tuple(stored.point for stored in store.fixes())
-    checkpoint = read_checkpoint(args.run_dir / FILE, Checkpoint) if args.is_taking_over else None
+    checkpoint = read_checkpoint(args.run_dir / CHECKPOINT_FILE, Checkpoint) if args.is_taking_over else None
     run_id = read_run_id(args.run_dir)
     if run_id and checkpoint is not None and checkpoint.run_id != run_id:
-        raise CheckpointError(f"{args.run_dir / FILE}: is of another run, {AT_BASE}")
+        raise CheckpointError(f"{args.run_dir / CHECKPOINT_FILE}: is of another run, {AT_BASE}")
     skipped: tuple[PointId, ...] = ()
     if checkpoint is None:
         parts = assemble(cfg, measured)
@@ -52,7 +51,7 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
         before = ""
         if checkpoint is None:
             parts.mission.handle(EmergencyKnown())
-            latched = [f"'ccatp clear {one}'" for one in active_ids(args.run_dir / EMERGENCIES)]
+            latched = [f"'ccatp clear {one}'" for one in active_ids(args.run_dir / EMERGENCIES_FILE)]
             if latched:
                 before = f"the last run ended with an emergency that is not cleared: {', '.join(latched)}; "
         parts.mission.handle(Pause(_why_held(before, points, measured, skipped)))

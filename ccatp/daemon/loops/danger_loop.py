@@ -33,7 +33,7 @@ from ccatp.missions import kind_of
 from ccatp.safety.emergency_latch import Emergency, EmergencyLatch
 from ccatp.safety.rules import SafetyRules
 
-FILE = "emergencies.json"
+EMERGENCIES_FILE = "emergencies.json"
 # Enough for some hundred active emergencies and as many cleared ones.
 RESERVE_BYTES = 65536
 
@@ -122,7 +122,7 @@ class DangerLoop(RobotLoop):
         super().__init__("danger", "monitor", args, context)
         self._cfg = cfg = args.config
         self.monitor: SafetyRules = kind_of(cfg).rules.get()(cfg)
-        self.monitor.latch = PersistentEmergencyLatch(args.run_dir / FILE, self.log)
+        self.monitor.latch = PersistentEmergencyLatch(args.run_dir / EMERGENCIES_FILE, self.log)
         self.peer = self._estimates = EstimateSubscriber(
             context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
         )

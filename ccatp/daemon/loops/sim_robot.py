@@ -16,7 +16,7 @@ from ccatp.errors import ExitStatus
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.missions import kind_of
 from ccatp.sim.fault_plan import FaultPlan, read_plan
-from ccatp.sim.ground_truth import FILE
+from ccatp.sim.ground_truth import ROBOT_FILE
 
 
 def main() -> int:
@@ -35,7 +35,7 @@ def main() -> int:
             truth_pub=args.endpoints.of("truth"),
             log=open_log(args.run_dir / "log.jsonl", "dataloop"),
             faults=plan,
-            body_file=args.run_dir / FILE,
+            body_file=args.run_dir / ROBOT_FILE,
             is_resuming=args.is_resuming,
         )
         return 0

@@ -32,7 +32,7 @@ from ccatp.links.topics import (
     TreatmentKind,
 )
 from ccatp.localizer import Localizer
-from ccatp.records.checkpoint import FILE, CheckpointFile
+from ccatp.records.checkpoint import CHECKPOINT_FILE, CheckpointFile
 from ccatp.records.store import MissionStore
 from ccatp.sensing.wheel_means import as_standing
 from ccatp.survey.behaviours import MissionCommand
@@ -58,7 +58,7 @@ class CheckpointWriter:
     """Keeps the checkpoint up to date; ``boot``: boot number of the robot."""
 
     def __init__(self, run_dir: Path, localizer: Localizer, mission: Mission, is_patient: bool) -> None:
-        self._file = CheckpointFile(run_dir / FILE, is_patient=is_patient)
+        self._file = CheckpointFile(run_dir / CHECKPOINT_FILE, is_patient=is_patient)
         self._localizer, self._mission = localizer, mission
         self._run_id = read_run_id(run_dir)
         self._written: SurveyState | None = None

@@ -21,7 +21,7 @@ from ccatp.config.files import read_text
 from ccatp.core import Cause, Severity
 from ccatp.links.topics import Alarm, SeverityName
 
-FILE = "alarms.jsonl"
+ALARMS_FILE = "alarms.jsonl"
 # Bounds of the file, for an alarm that is raised and ended for hours; the list itself stays complete.
 MAX_LINES, MOST_BYTES = 10_000, 1 << 23
 # From this severity on a cause is an alarm at once, and stays in the list until it is acknowledged.
@@ -70,7 +70,7 @@ _decoder = msgspec.json.Decoder(AlarmEvent)
 def read_history(run_dir: Path) -> Iterator[AlarmEvent]:
     """The events of the alarms of a run, oldest first; a line that was cut off by a kill is left out."""
     try:
-        text = read_text(run_dir / FILE, MOST_BYTES)
+        text = read_text(run_dir / ALARMS_FILE, MOST_BYTES)
     except (OSError, UnicodeDecodeError):  # there is none yet, or it cannot be read
         return
     for line in text.splitlines():
@@ -84,7 +84,7 @@ class AlarmList:
     def __init__(
         self, run_dir: Path, log: structlog.typing.FilteringBoundLogger, now: Callable[[], str] = utc_now
     ) -> None:
-        self._path, self._log, self._now = run_dir / FILE, log, now
+        self._path, self._log, self._now = run_dir / ALARMS_FILE, log, now
         self._alarms: dict[str, Alarm] = {}
         self._since: dict[str, tuple[float, float]] = {}  # start of the active ones by the robot's and the host's clock
         self._lines = 0

@@ -14,16 +14,16 @@ from uuid import uuid4
 
 from ccatp.config.files import read_input, read_text, write_durably
 from ccatp.config.mission import MissionConfig
-from ccatp.daemon.loops.danger_loop import FILE as EMERGENCIES
+from ccatp.daemon.loops.danger_loop import EMERGENCIES_FILE
 from ccatp.daemon.supervision.run_text import RunText
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import BESIDE, LOCK_FILE, TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.missions import MissionKind, kind_of
 from ccatp.records.recorder import TELEMETRY, read_metadata
 
-FILE = Path("runs") / "unfinished"
+UNFINISHED_FILE = Path("runs") / "unfinished"
 # Emergencies that were active when a run finished, for the next run, because without a daemon nobody can clear them.
-LATCHED_FILE = Path("runs") / EMERGENCIES
+LATCHED_FILE = Path("runs") / EMERGENCIES_FILE
 # In the run directory: properties that a resumed run keeps, and that are not in its configuration.
 ORIGIN_FILE = "origin.json"
 # Complete, or at base after an abort: such a run is not resumed.
@@ -33,16 +33,17 @@ FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
 def find_resumable() -> Path | None:
     """The directory of the run that did not finish, ``None`` if there is none with a mission."""
     try:
-        kept = read_input(FILE)
+        kept = read_input(UNFINISHED_FILE)
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise ConfigError(f"--resume-last: cannot read {FILE}: {error}; remove it to begin a new run") from error
+        text = f"cannot read {UNFINISHED_FILE}: {error}; remove it to begin a new run"
+        raise ConfigError(f"--resume-last: {text}") from error
     text = os.fsdecode(kept.strip())
     if not text or not kept.endswith(b"\n"):  # written as one whole line
         raise ConfigError(
-            f"--resume-last: {FILE} is damaged, so the run that did not finish is not known; name it with --resume "
-            "--run-dir, or remove the file to begin a new run with the robot at base"
+            f"--resume-last: {UNFINISHED_FILE} is damaged, so the run that did not finish is not known; name it with "
+            "--resume --run-dir, or remove the file to begin a new run with the robot at base"
         )
     run_dir = Path(text)
     return run_dir if (run_dir / "mission.sqlite").exists() else None
@@ -70,13 +71,13 @@ def finished_summary(run_dir: Path) -> dict[str, Any] | None:
 
 
 def mark_resumable(run_dir: Path) -> None:
-    """Record in ``FILE`` that a run has begun; raises ``ConfigError`` if it cannot be written."""
+    """Record in ``UNFINISHED_FILE`` that a run has begun; raises ``ConfigError`` if it cannot be written."""
     try:
-        FILE.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(FILE, os.fsencode(run_dir) + b"\n")
+        UNFINISHED_FILE.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(UNFINISHED_FILE, os.fsencode(run_dir) + b"\n")
     except OSError as error:
         raise ConfigError(
-            f"--resume-last: cannot write {FILE}: {error.strerror}; start where ./runs can be made"
+            f"--resume-last: cannot write {UNFINISHED_FILE}: {error.strerror}; start where ./runs can be made"
         ) from error
 
 
@@ -84,7 +85,7 @@ def clear_finished(status: int, run_dir: Path) -> None:
     """Remove the record of a finished run; save its active emergencies for the next one. ConfigError: it cannot."""
     if status not in FINISHED:
         return
-    emergencies = run_dir / EMERGENCIES
+    emergencies = run_dir / EMERGENCIES_FILE
     kept = emergencies.read_bytes() if emergencies.exists() else b""
     try:
         is_latched = bool(kept) and bool(json.loads(kept)["active"])
@@ -97,7 +98,7 @@ def clear_finished(status: int, run_dir: Path) -> None:
             LATCHED_FILE.unlink(missing_ok=True)
     except OSError as error:
         raise ConfigError(f"--resume-last: cannot keep {LATCHED_FILE}: {error.strerror}") from error
-    FILE.unlink(missing_ok=True)
+    UNFINISHED_FILE.unlink(missing_ok=True)
 
 
 def take_over_emergencies(run_dir: Path) -> bool:
@@ -105,7 +106,7 @@ def take_over_emergencies(run_dir: Path) -> bool:
     try:
         kept = LATCHED_FILE.read_bytes()
         run_dir.mkdir(parents=True, exist_ok=True)
-        write_durably(run_dir / EMERGENCIES, kept)
+        write_durably(run_dir / EMERGENCIES_FILE, kept)
     except FileNotFoundError:
         return False
     except OSError as error:

@@ -20,7 +20,7 @@ from ccatp import conditions
 from ccatp.conditions import text_of
 from ccatp.config.models import AlarmsConfig
 from ccatp.core import Cause, EmergencyKind, Severity
-from ccatp.daemon.loops.danger_loop import FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
+from ccatp.daemon.loops.danger_loop import EMERGENCIES_FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
 from ccatp.daemon.operator import alarms, webhook
 from ccatp.daemon.operator.alarms import LEAST_S, ActiveCause, AlarmList, active_cause, read_history
 from ccatp.daemon.operator.webhook import AlarmWebhook, changes
@@ -141,7 +141,7 @@ def test_a_successor_has_the_same_list_and_the_file_is_bounded(
     update(known, [(FAN, NONE), (QUAKE, NONE)], 10.0)
     known.acknowledge("fan_weak", "anna", 11.0)
     update(known, [(QUAKE, NONE)], 12.0)
-    with (tmp_path / alarms.FILE).open("a") as file:
+    with (tmp_path / alarms.ALARMS_FILE).open("a") as file:
         file.write('\n{"utc": "cut o')
     assert make(tmp_path).alarms == known.alarms
     assert [(e.event, e.name, e.by) for e in read_history(tmp_path)] == [
@@ -190,7 +190,7 @@ def log(reported: StringIO) -> Log:
 
 @pytest.mark.fault("P2")
 def test_an_emergency_is_there_after_a_restart_until_it_is_cleared(tmp_path: Path, log: Log) -> None:
-    path = tmp_path / FILE
+    path = tmp_path / EMERGENCIES_FILE
     latch = PersistentEmergencyLatch(path, log)
     assert not latch.is_latched
     assert latch.raise_emergency("fire", "a", "smoke") is None
@@ -210,16 +210,16 @@ def test_an_emergency_is_there_after_a_restart_until_it_is_cleared(tmp_path: Pat
 def test_a_file_that_cannot_be_read_counts_as_an_emergency(
     tmp_path: Path, log: Log, reported: StringIO, text: str
 ) -> None:
-    (tmp_path / FILE).write_text(text)
-    latch = PersistentEmergencyLatch(tmp_path / FILE, log)
+    (tmp_path / EMERGENCIES_FILE).write_text(text)
+    latch = PersistentEmergencyLatch(tmp_path / EMERGENCIES_FILE, log)
     assert latch.is_latched
     newest = latch.newest
     assert newest is not None
     assert f"'ccatp clear {UUID(newest.id)}' ends it" in reported.getvalue()
-    again = PersistentEmergencyLatch(tmp_path / FILE, log)
+    again = PersistentEmergencyLatch(tmp_path / EMERGENCIES_FILE, log)
     assert again.newest == newest  # the same after a restart
     assert again.clear(newest.id, at_base_or_held=True) is None
-    assert not PersistentEmergencyLatch(tmp_path / FILE, log).is_latched
+    assert not PersistentEmergencyLatch(tmp_path / EMERGENCIES_FILE, log).is_latched
 
 
 def no_room(*_: int) -> None:
@@ -229,7 +229,7 @@ def no_room(*_: int) -> None:
 def test_a_disk_that_refuses_does_not_keep_an_emergency_from_being_latched(
     tmp_path: Path, log: Log, reported: StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    latch = PersistentEmergencyLatch(tmp_path / FILE, log)
+    latch = PersistentEmergencyLatch(tmp_path / EMERGENCIES_FILE, log)
     monkeypatch.setattr("os.fsync", no_room)
     assert latch.raise_emergency("fire", "a") is None
     assert latch.is_latched
@@ -239,11 +239,11 @@ def test_a_disk_that_refuses_does_not_keep_an_emergency_from_being_latched(
 @pytest.mark.fault("P13")
 def test_an_emergency_is_kept_on_a_full_disk(tmp_path: Path, log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     """The room for it was taken before; a full disk gives no more."""
-    latch = PersistentEmergencyLatch(tmp_path / FILE, log)
-    assert (tmp_path / f"{FILE}.new").stat().st_size == RESERVE_BYTES
+    latch = PersistentEmergencyLatch(tmp_path / EMERGENCIES_FILE, log)
+    assert (tmp_path / f"{EMERGENCIES_FILE}.new").stat().st_size == RESERVE_BYTES
     monkeypatch.setattr("os.posix_fallocate", no_room)
     assert latch.raise_emergency("earthquake", "a") is None
-    assert PersistentEmergencyLatch(tmp_path / FILE, log).is_shaking
+    assert PersistentEmergencyLatch(tmp_path / EMERGENCIES_FILE, log).is_shaking
 
 
 # -- posts of alarms ---------------------------------------------------------------------------------------------------
@@ -360,7 +360,7 @@ def test_without_an_address_there_is_no_thread() -> None:
 
 def test_an_event_after_a_line_that_a_kill_cut_off_is_read_again(tmp_path: Path) -> None:
     update(make(tmp_path), [(FIRE, NONE)], 10.0)
-    path = tmp_path / alarms.FILE
+    path = tmp_path / alarms.ALARMS_FILE
     whole = path.read_bytes()
     for kept in range(len(whole) + 1):
         path.write_bytes(whole[:kept])
@@ -370,7 +370,7 @@ def test_an_event_after_a_line_that_a_kill_cut_off_is_read_again(tmp_path: Path)
 
 
 def test_emergencies_whose_file_was_cut_off_or_damaged_are_taken_for_one(tmp_path: Path, log: Log) -> None:
-    path = tmp_path / FILE
+    path = tmp_path / EMERGENCIES_FILE
     latch = PersistentEmergencyLatch(path, log)
     latch.raise_emergency("fire", str(uuid.UUID(int=1)))
     latch.raise_emergency("power", str(uuid.UUID(int=2)), "the second")

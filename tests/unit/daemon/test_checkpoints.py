@@ -25,7 +25,7 @@ from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello, RobotData
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records.checkpoint import FILE, CheckpointError, CheckpointFile, read_checkpoint
+from ccatp.records.checkpoint import CHECKPOINT_FILE, CheckpointError, CheckpointFile, read_checkpoint
 from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import BudgetProgress, TimeBudget
@@ -316,7 +316,7 @@ def test_files_of_another_run_are_refused(tmp_path: Path, measured: Measured) ->
     for where in (older, one):
         build(replace(where, is_resuming=True))[1].close()
     for foreign in (older, two):
-        for name, why in ((FILE, "is of another run, .* set it at base"), ("mission.sqlite", "another run")):
+        for name, why in ((CHECKPOINT_FILE, "is of another run, .* set it at base"), ("mission.sqlite", "another run")):
             before = (one.run_dir / name).read_bytes()
             (one.run_dir / name).write_bytes((foreign.run_dir / name).read_bytes())
             with pytest.raises((CheckpointError, StoreUnusable), match=why):
@@ -344,8 +344,8 @@ def test_the_checkpoint_is_due_ten_times_a_second_and_at_each_hold_or_abort(driv
         if writer.is_due(seq):
             writer.write(seq, 0.01 * seq, 0.02 * seq)
         writer.close()
-        found = read_checkpoint(tmp_path / FILE, Checkpoint)
-        writer._file = CheckpointFile(tmp_path / FILE, is_patient=True)
+        found = read_checkpoint(tmp_path / CHECKPOINT_FILE, Checkpoint)
+        writer._file = CheckpointFile(tmp_path / CHECKPOINT_FILE, is_patient=True)
         assert found is not None
         seqs.append(found.seq)
     writer.close()
@@ -368,15 +368,15 @@ def test_a_checkpoint_of_an_older_format_is_refused(driving: Story, tmp_path: Pa
     elif change != "none":
         state = record[1 + Checkpoint.__struct_fields__.index("state")]
         state[SurveyState.__struct_fields__.index(change)] = "earthquake"
-    file = CheckpointFile(tmp_path / FILE, is_patient=True)
+    file = CheckpointFile(tmp_path / CHECKPOINT_FILE, is_patient=True)
     for _ in range(2):
         file.write(record)
     file.close()
     if change == "none":
-        assert read_checkpoint(tmp_path / FILE, Checkpoint) is not None
+        assert read_checkpoint(tmp_path / CHECKPOINT_FILE, Checkpoint) is not None
         return
     with pytest.raises(CheckpointError, match=r"checkpoint: of another version of ccatp \(.*\), so the robot's place"):
-        read_checkpoint(tmp_path / FILE, Checkpoint)
+        read_checkpoint(tmp_path / CHECKPOINT_FILE, Checkpoint)
 
 
 @pytest.mark.parametrize(

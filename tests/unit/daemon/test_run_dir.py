@@ -16,10 +16,10 @@ from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.daemon.run import PROCESSES as BEACON_PROCESSES
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.daemon.loops.danger_loop import FILE as EMERGENCIES
+from ccatp.daemon.loops.danger_loop import EMERGENCIES_FILE
 from ccatp.daemon.supervision.process import run_dir_in
 from ccatp.daemon.supervision.run_dir import (
-    FILE,
+    UNFINISHED_FILE,
     RunOptions,
     await_predecessors,
     clear_finished,
@@ -287,21 +287,21 @@ def test_a_run_is_found_until_it_has_finished(tmp_path: Path) -> None:
 def test_an_emergency_outlives_the_run(tmp_path: Path, kept: str) -> None:
     first, second, third = begin(tmp_path), tmp_path / "runs" / "two", tmp_path / "runs" / "three"
     assert not take_over_emergencies(second)
-    (first / EMERGENCIES).write_text(kept)
+    (first / EMERGENCIES_FILE).write_text(kept)
     clear_finished(ExitStatus.ABORTED, first)
     assert find_resumable() is None
     assert take_over_emergencies(second)
-    assert (second / EMERGENCIES).read_text() == kept
-    (second / EMERGENCIES).write_text('{"active": [], "cleared": ["a"]}')
+    assert (second / EMERGENCIES_FILE).read_text() == kept
+    (second / EMERGENCIES_FILE).write_text('{"active": [], "cleared": ["a"]}')
     clear_finished(ExitStatus.COMPLETE, second)
     assert not take_over_emergencies(third)
 
 
 def test_notes_that_cannot_be_read_or_written(tmp_path: Path) -> None:
-    latched = tmp_path / "runs" / EMERGENCIES
+    latched = tmp_path / "runs" / EMERGENCIES_FILE
     latched.mkdir(parents=True)
-    FILE.mkdir()
-    (tmp_path / EMERGENCIES).write_text("{")
+    UNFINISHED_FILE.mkdir()
+    (tmp_path / EMERGENCIES_FILE).write_text("{")
     with pytest.raises(ConfigError, match="--resume-last: cannot read"):
         find_resumable()
     with pytest.raises(ConfigError, match="--resume-last: cannot take over"):
