@@ -18,12 +18,13 @@ from ccatp.survey.planning.legs import (
 )
 from ccatp.survey.planning.search import SearchNode, leg_time, turn_time
 
-_TURNS_RAD = np.radians(np.arange(-180, 181, 2))
+# At 0.1 m from the rim the robot has room for 7 deg, and 3 to 5 deg lead it away: the steps must be finer than these.
+_TURNS_RAD = np.radians(np.arange(-180, 181))
 _NO_TURN = len(_TURNS_RAD) // 2
-# A longer leg would only lead along the rim; straight away from it, or out of a corner, 0.2 m are enough.
-_DISTANCES_M = np.r_[0:401:10] * 1e-3
-# Between two turns a sensor at 0.13 m is at most 0.13 (1 - cos(1 deg)) = 20 um further out than at them.
-_BETWEEN_TURNS_M = 2e-5
+# Straight away from the rim, or out of a corner, 0.2 m are enough. Beside the rim, with room for 3 deg, it takes 0.6 m.
+_DISTANCES_M = np.r_[0:601:20] * 1e-3
+# Between two turns a sensor at 0.13 m is at most 0.13 (1 - cos(0.5 deg)) = 5 um further out than at them.
+_BETWEEN_TURNS_M = 5e-6
 _ROUNDING_M = 1e-6
 _MILLIMETRE_M = 1e-3
 
@@ -33,7 +34,7 @@ def find_escape(mirror: Mirror, body: Body, start: SearchNode, limits: LimitsCon
 
     It brings no sensor nearer to the rim than ``turn_clearance_m``, or than it is already. If every motion does so, the
     one that brings a sensor least near is best. Otherwise the fastest is best, and then the smallest turn. Raises
-    ``UnreachablePointError`` if there is no such place within 0.4 m.
+    ``UnreachablePointError`` if there is no such place within 0.6 m.
     """
     x0, y0 = start.place.x_m, start.place.y_m
     courses = start.course_rad + _TURNS_RAD
@@ -61,7 +62,7 @@ def find_escape(mirror: Mirror, body: Body, start: SearchNode, limits: LimitsCon
             best = deficit_mm, cost_s, turn_rad, SearchNode(place, float(courses[turn]), cost_s, way == 1, start)
     if best is None:
         raise UnreachablePointError(
-            f"no place to turn within 0.4 m of ({x0:.3f}, {y0:.3f}) m, {start.place.depth_m:.3f} m from the rim of "
+            f"no place to turn within 0.6 m of ({x0:.3f}, {y0:.3f}) m, {start.place.depth_m:.3f} m from the rim of "
             f"{mirror.name}"
         )
     return best[3]

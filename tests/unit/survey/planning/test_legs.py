@@ -255,5 +255,5 @@ def test_base_in_the_clearance(thesis: Any) -> None:
 
 
 def test_mirror_too_small_to_turn_on(small: Any) -> None:
-    with pytest.raises(UnreachablePointError, match=r"no place to turn within 0\.4 m of .* 0\.1\d\d m from the rim"):
+    with pytest.raises(UnreachablePointError, match=r"no place to turn within 0\.6 m of .* 0\.1\d\d m from the rim"):
         go(small, small.mirror.base_pose)
