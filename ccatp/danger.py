@@ -29,7 +29,8 @@ from ccatp.core import NO_MOTION, Corner, EdgeSample, EventCode, Permits, Verdic
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase
+from ccatp.safety.edge_detector import EdgeDetector, EdgePhase
+from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
 from ccatp.safety.monitor import HealthMonitor

@@ -28,7 +28,8 @@ from ccatp.config.models import DangerConfig, RobotConfig
 from ccatp.core import EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim
-from ccatp.safety.edge_detector import EdgeDetector, EdgeLimits, EdgeMap, EdgePhase
+from ccatp.safety.edge_detector import EdgeDetector, EdgeLimits, EdgePhase
+from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.wheel_odometry import Odometry, WheelTrack, pose_at
 from ccatp.sensing.wheel_means import largest_rate_rad_s
 

@@ -22,7 +22,7 @@ from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
-from ccatp.safety.edge_detector import EdgeMap
+from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.wheel_odometry import KNOTS_KEPT, Odometry, WheelTrack, pose_at
 from tests.support.scenario import World, config_of
 

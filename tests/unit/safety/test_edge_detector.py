@@ -11,16 +11,8 @@ import pytest
 
 from ccatp.conditions import BEYOND_SEAM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD, Condition
 from ccatp.config.load import load_config
-from ccatp.safety.edge_detector import (
-    DIRECTION_TRAVEL_M,
-    LONG_ON,
-    Axis,
-    EdgeDetector,
-    EdgeLimits,
-    EdgeMap,
-    EdgePhase,
-    SeamNear,
-)
+from ccatp.safety.edge_detector import DIRECTION_TRAVEL_M, LONG_ON, EdgeDetector, EdgeLimits, EdgePhase
+from ccatp.safety.edge_map import Axis, EdgeMap, SeamNear
 from ccatp.safety.wheel_odometry import Odometry
 
 GAP_M = 0.010

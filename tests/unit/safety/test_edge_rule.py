@@ -11,7 +11,8 @@ from ccatp.config.models import Config
 from ccatp.core import EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim
-from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase, SeamNear
+from ccatp.safety.edge_detector import EdgeDetector, EdgePhase
+from ccatp.safety.edge_map import EdgeMap, SeamNear
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 
 MS = 1e-3
