@@ -29,7 +29,7 @@ from ccatp.core import NO_MOTION, Corner, EdgeSample, EventCode, Permits, Verdic
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.safety.edge_detector import EdgeDetector, EdgePhase
+from ccatp.safety.edge_episode import EdgeEpisode, EdgePhase
 from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
@@ -193,7 +193,7 @@ class DangerMonitor(SafetyRules):
                 found.append(conditions.EDGE_SENSOR_STAYS_OFF.found(CORNERS[i].value, episode.retreat_m, limit_m))
         return found
 
-    def _stays_off(self, sensor: int, episode: EdgeDetector, limit_m: float) -> bool:
+    def _stays_off(self, sensor: int, episode: EdgeEpisode, limit_m: float) -> bool:
         """Whether a sensor stays off although the robot has left the edge. Remains true until the episode ends."""
         if episode.phase is not EdgePhase.DECLARED:
             return False
@@ -248,7 +248,7 @@ class DangerMonitor(SafetyRules):
 
     # -- arbitration ----------------------------------------------------------------------------------------------
 
-    def _declared(self) -> EdgeDetector | None:
+    def _declared(self) -> EdgeEpisode | None:
         return next((e for e in self._edges.episodes if e is not None and e.phase is EdgePhase.DECLARED), None)
 
     def _arbitrate(self, seq: int, t_s: float, findings: Sequence[MonitorFinding]) -> Verdict:
@@ -266,7 +266,7 @@ class DangerMonitor(SafetyRules):
         return emergency or Verdict.normal(seq, t_s)
 
     def _edge_verdict(
-        self, seq: int, t_s: float, declared: EdgeDetector | None, missing: MonitorFinding | None
+        self, seq: int, t_s: float, declared: EdgeEpisode | None, missing: MonitorFinding | None
     ) -> Verdict:
         origin, barred = self._origin, self._origin.direction
         if declared is not None:

@@ -28,7 +28,7 @@ from ccatp.config.models import DangerConfig, RobotConfig
 from ccatp.core import EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim
-from ccatp.safety.edge_detector import EdgeDetector, EdgeLimits, EdgePhase
+from ccatp.safety.edge_episode import EdgeEpisode, EdgeLimits, EdgePhase
 from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.wheel_odometry import Odometry, WheelTrack, pose_at
 from ccatp.sensing.wheel_means import largest_rate_rad_s
@@ -65,7 +65,7 @@ class EdgeRule:
         self.track = WheelTrack(
             robot.wheel_radius_m, robot.wheel_base_m, self._stale_after_s, self._reach_s, largest_rate_rad_s(robot)
         )
-        self.episodes: list[EdgeDetector | None] = [None] * SENSORS
+        self.episodes: list[EdgeEpisode | None] = [None] * SENSORS
         self._odometry: Odometry | None = None
         self._last_t_s: float | None = None
         self._all_off = self._all_on = 0
@@ -157,7 +157,7 @@ class EdgeRule:
 
     def _place(
         self,
-        episode: EdgeDetector,
+        episode: EdgeEpisode,
         offset_m: tuple[float, float],
         odometry: Odometry,
         estimate: EstimateMessage,
@@ -167,10 +167,10 @@ class EdgeRule:
         pose = pose_at(self.track, odometry.t_s, estimate.t_s, known)
         episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m + more_sigma_m)
 
-    def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: EstimateMessage | None) -> EdgeDetector:
+    def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: EstimateMessage | None) -> EdgeEpisode:
         ox, oy = self._offsets[i]
         moved_m = (abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * hypot(ox, oy)) * dt_s
-        episode = EdgeDetector(self._limits, self._map, odometry, ((ox, oy), moved_m), self._half_base_m)
+        episode = EdgeEpisode(self._limits, self._map, odometry, ((ox, oy), moved_m), self._half_base_m)
         if estimate is not None:
             self._place(episode, (ox, oy), odometry, estimate)
         self.opened[i] += 1

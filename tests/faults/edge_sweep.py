@@ -27,7 +27,7 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, PanelId, Verdict
 from ccatp.danger import DangerMonitor
 from ccatp.mirror.mirror import Mirror
-from ccatp.safety.edge_detector import EdgeLimits
+from ccatp.safety.edge_episode import EdgeLimits
 from ccatp.studies.danger_study import Rig
 from tests.support.scenario import config_of, mirror_of
 

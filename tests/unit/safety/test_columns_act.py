@@ -12,7 +12,7 @@ from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.operator.alarms import active_cause
 from ccatp.mirror.mirror import Mirror
-from ccatp.safety import edge_detector, emergency_latch
+from ccatp.safety import edge_episode, emergency_latch
 from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
 from ccatp.survey.events import MissionState
@@ -168,12 +168,12 @@ def test_trusts_wheels_is_whether_odometry_is_used_in_the_hold(row: Condition, m
 
 @pytest.mark.parametrize("name", ["RIM_AHEAD", "BEYOND_SEAM", "NO_SEAM", "OFF_WITHOUT_WHEELS"])
 def test_motion_and_action_of_an_edge_give_permits_and_code(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    row: Condition = getattr(edge_detector, name)
+    row: Condition = getattr(edge_episode, name)
     cfg, mirror = config_of("fyst-m1"), mirror_of("fyst-m1")
     right = max(mirror.panels.values(), key=lambda panel: (panel.x_m, -abs(panel.y_m)))
 
     def verdict(**cells: Any) -> Verdict:
-        monkeypatch.setattr(edge_detector, "RIM_AHEAD", replace(row, **cells))
+        monkeypatch.setattr(edge_episode, "RIM_AHEAD", replace(row, **cells))
         story = EdgeStory(cfg, mirror, (right.x_m + right.half_x_m - 0.091, right.y_m, 0.0))
         return [story.frame(0.1), story.frame(0.1, off=FRONT)][-1]
 

@@ -11,7 +11,7 @@ from ccatp.config.models import Config
 from ccatp.core import EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim
-from ccatp.safety.edge_detector import EdgeDetector, EdgePhase
+from ccatp.safety.edge_episode import EdgeEpisode, EdgePhase
 from ccatp.safety.edge_map import EdgeMap, SeamNear
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 
@@ -237,7 +237,7 @@ def test_an_edge_seen_ahead_is_counted_once(rule: Rule) -> None:
 # -- (e) a fix --------------------------------------------------------------------------------------------------------
 
 
-def declared(rule: Rule, sigma_m: float = 0.001) -> EdgeDetector:
+def declared(rule: Rule, sigma_m: float = 0.001) -> EdgeEpisode:
     """An edge, and after it the sensor stays off while the robot is moved back and comes to rest."""
     rule.feed([OFF_FL] * 80, v=0.1, estimate=rule.estimate(sigma_m=sigma_m))
     rule.feed([OFF_FL] * 100, v=-0.1, estimate=rule.estimate(sigma_m=sigma_m))
@@ -250,14 +250,14 @@ def declared(rule: Rule, sigma_m: float = 0.001) -> EdgeDetector:
     return episode
 
 
-def measured(rule: Rule, sigma_m: float, *, v: float = 0.0, omega: float = 0.0, flags: Any = OFF_FL) -> EdgeDetector:
+def measured(rule: Rule, sigma_m: float, *, v: float = 0.0, omega: float = 0.0, flags: Any = OFF_FL) -> EdgeEpisode:
     rule.feed([flags] * 10, v=v, omega=omega, estimate=rule.estimate(sigma_m=sigma_m))
     episode = rule.rule.episodes[0]
     assert episode is not None
     return episode
 
 
-def phase_of(episode: EdgeDetector) -> EdgePhase:
+def phase_of(episode: EdgeEpisode) -> EdgePhase:
     """The phase as it is now: a checker of types would take it for what it was at the last look."""
     return episode.phase
 

@@ -49,7 +49,7 @@ class EdgeLimits:
         self.debounce, self.clear = cfg.debounce_samples, cfg.clear_samples
 
 
-class EdgeDetector:
+class EdgeEpisode:
     """One episode of one sensor. Places are in the frame of the odometry unless they are called map places.
 
     ``sensor``: its place in the robot frame, and how far it moves between two samples, m (the detection may be late by

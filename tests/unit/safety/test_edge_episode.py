@@ -11,7 +11,7 @@ import pytest
 
 from ccatp.conditions import BEYOND_SEAM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD, Condition
 from ccatp.config.load import load_config
-from ccatp.safety.edge_detector import DIRECTION_TRAVEL_M, LONG_ON, EdgeDetector, EdgeLimits, EdgePhase
+from ccatp.safety.edge_episode import DIRECTION_TRAVEL_M, LONG_ON, EdgeEpisode, EdgeLimits, EdgePhase
 from ccatp.safety.edge_map import Axis, EdgeMap, SeamNear
 from ccatp.safety.wheel_odometry import Odometry
 
@@ -63,12 +63,12 @@ class Sensor:
     turn: float = 0.0
     gap_m: float = GAP_M
     has_map: bool = True
-    episode: EdgeDetector = field(init=False)
+    episode: EdgeEpisode = field(init=False)
 
     def __post_init__(self) -> None:
         limits = EdgeLimits(self.gap_m, DANGER)
         edge_map = cast(EdgeMap, self.map)
-        self.episode = EdgeDetector(limits, edge_map, self.odometry, (OFFSET, MOVED_M), HALF_BASE_M)
+        self.episode = EdgeEpisode(limits, edge_map, self.odometry, (OFFSET, MOVED_M), HALF_BASE_M)
         if self.has_map:
             self.episode.place_on_map(MAP0, self.pose[2] + self.turn, SIGMA_M)
 
