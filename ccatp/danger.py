@@ -29,7 +29,7 @@ from ccatp.core import NO_MOTION, Corner, EdgeSample, EventCode, Permits, Verdic
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.safety.edge_episode import EdgeEpisode, EdgePhase
+from ccatp.safety.edge_episode import FoundEdge
 from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
@@ -188,21 +188,22 @@ class DangerMonitor(SafetyRules):
         if self._edges.is_lifted:
             found.append(conditions.LIFTED.found("edge", 4.0, 3.0))
         limit_m = self._health.stuck_off_m
+        self._doubt_sensors(limit_m)
         for i, episode in enumerate(self._edges.episodes):
-            if episode is not None and self._stays_off(i, episode, limit_m):
+            if episode is not None and episode.is_doubted:
                 found.append(conditions.EDGE_SENSOR_STAYS_OFF.found(CORNERS[i].value, episode.retreat_m, limit_m))
         return found
 
-    def _stays_off(self, sensor: int, episode: EdgeEpisode, limit_m: float) -> bool:
-        """Whether a sensor stays off although the robot has left the edge. Remains true until the episode ends."""
-        if episode.phase is not EdgePhase.DECLARED:
-            return False
-        if not episode.is_doubted and episode.retreat_m >= limit_m:
+    def _doubt_sensors(self, limit_m: float) -> None:
+        """Doubt each sensor that stays off although the robot has left the edge, until its episode ends."""
+        for i, episode in enumerate(self._edges.episodes):
+            if episode is None or episode.edge is None or episode.retreat_m < limit_m:
+                continue
             known = self._known
             others = (e is None or e is episode or e.is_on for e in self._edges.episodes)
-            is_over_rim = known is not None and self._map.is_beyond_rim(self._place(known, sensor))
-            episode.is_doubted = all(others) and not is_over_rim
-        return episode.is_doubted
+            is_over_rim = known is not None and self._map.is_beyond_rim(self._place(known, i))
+            if all(others) and not is_over_rim:
+                episode.is_doubted = True
 
     # -- what is missing ------------------------------------------------------------------------------------------
 
@@ -248,8 +249,8 @@ class DangerMonitor(SafetyRules):
 
     # -- arbitration ----------------------------------------------------------------------------------------------
 
-    def _declared(self) -> EdgeEpisode | None:
-        return next((e for e in self._edges.episodes if e is not None and e.phase is EdgePhase.DECLARED), None)
+    def _declared(self) -> FoundEdge | None:
+        return next((e.edge for e in self._edges.episodes if e is not None and e.edge is not None), None)
 
     def _arbitrate(self, seq: int, t_s: float, findings: Sequence[MonitorFinding]) -> Verdict:
         missing = gravest(findings)
@@ -266,11 +267,11 @@ class DangerMonitor(SafetyRules):
         return emergency or Verdict.normal(seq, t_s)
 
     def _edge_verdict(
-        self, seq: int, t_s: float, declared: EdgeEpisode | None, missing: MonitorFinding | None
+        self, seq: int, t_s: float, declared: FoundEdge | None, missing: MonitorFinding | None
     ) -> Verdict:
         origin, barred = self._origin, self._origin.direction
         if declared is not None:
-            a, b, c, d = (e is not None and e.phase is EdgePhase.DECLARED for e in self._edges.episodes)
+            a, b, c, d = (e is not None and e.edge is not None for e in self._edges.episodes)
             off, turn = (a, b, c, d), not barred and all(e is None or e.permits_turn for e in self._edges.episodes)
             row, signal = declared.cause, CORNERS[off.index(True)].value
             value, limit = declared.value_m, declared.limit_m

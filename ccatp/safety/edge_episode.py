@@ -4,14 +4,13 @@ An episode is the time from the first "off" of a sensor until it is safely back 
 """
 
 from enum import Enum, auto
-from math import cos, hypot, inf, sin, sqrt
+from math import cos, hypot, sin, sqrt
+from typing import NamedTuple
 
 from ccatp.conditions import BEYOND_SEAM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD, Condition
 from ccatp.config.models import DangerConfig
-from ccatp.safety.edge_map import Axis, EdgeMap
+from ccatp.safety.edge_map import Axis, EdgeMap, Place
 from ccatp.safety.wheel_odometry import Odometry
-
-Place = tuple[float, float]
 
 # Length over which the direction of a sensor's motion is computed: far above the encoder noise at rest (1e-5 m per
 # minute), far below every limit of the rules.
@@ -29,32 +28,93 @@ class EdgePhase(Enum):
     SEAM = auto()  # the map explains it by a seam
     NO_MAP = auto()  # the map does not explain it
     RIM = auto()  # the map has the rim ahead
-    DECLARED = auto()  # an edge
 
 
 class EdgeLimits:
     """The limits of the edge rule."""
 
     def __init__(self, gap_m: float, cfg: DangerConfig) -> None:
-        self.sigmas, self.margin_m = cfg.map_sigmas, cfg.map_margin_m
-        self.gap_m, self.tolerance_m, self.extra_m = gap_m, cfg.gap_tolerance_m, cfg.seam_extra_m
-        self.no_map_m, self.turn_m = cfg.no_map_travel_m, cfg.turn_travel_limit_m
-        width = gap_m + cfg.gap_tolerance_m
+        self.sigmas = cfg.map_sigmas
+        self.margin_m = cfg.map_margin_m
+        self.tolerance_m = cfg.gap_tolerance_m
+        self.extra_m = cfg.seam_extra_m
+        self.no_map_m = cfg.no_map_travel_m
+        self.turn_m = cfg.turn_travel_limit_m
+        self.width_m = width = gap_m + cfg.gap_tolerance_m
         # A narrow seam may be crossed at a larger angle, because the limit is the length that the sensor travels.
         self.min_cosine = min(cos(cfg.max_crossing_angle_rad), width / cfg.slanted_crossing_m)
         # Where two seams cross, a path oblique to one is steep to the other. A crossing of both is never longer than
         # the sum of the two chords.
         self.crossing_m = width / self.min_cosine + width / sqrt(1.0 - self.min_cosine**2) + cfg.seam_extra_m
         self.outward_turn_m = cfg.outward_turn_limit_m
-        self.debounce, self.clear = cfg.debounce_samples, cfg.clear_samples
+        self.debounce = cfg.debounce_samples
+        self.clear = cfg.clear_samples
+
+
+class Start(NamedTuple):
+    """Where an episode began, in the frame of the odometry: robot and sensor, m, and heading."""
+
+    robot: Place
+    sensor: Place
+    heading_rad: float
+
+
+class OnMap(NamedTuple):
+    """Where the sensor went off on the map: its place there, and the turn from the odometry's frame to the deck."""
+
+    place: Place
+    cos: float
+    sin: float
+    sigma_m: float
+
+
+class Travel(NamedTuple):
+    """Displacements of sensor and robot since the start, m; deck frame, without a place on the map the odometry's."""
+
+    sensor: Place
+    robot: Place
+
+
+class Departure(NamedTuple):
+    """How the sensor left the panel: unit vector of its motion, and the sign of the robot's turn.
+
+    ``is_by_turn``: the turn, not the robot's translation, led there.
+    """
+
+    direction: Place
+    is_by_turn: bool
+    turn_sign: float
+
+
+class SeamCrossing(NamedTuple):
+    """A seam that the sensor crosses; ``begin``: from where its travel counts.
+
+    ``axis``: deck coordinate that is constant along the seam; ``side``: sign of the motion along it, 0: unknown.
+    """
+
+    axis: Axis
+    side: float
+    begin: Travel
+    is_second: bool = False
+
+
+class FoundEdge(NamedTuple):
+    """An edge: the rule that found it, and the travel that exceeded its limit, m."""
+
+    cause: Condition
+    value_m: float
+    limit_m: float
+
+
+_NO_TRAVEL = Travel((0.0, 0.0), (0.0, 0.0))
 
 
 class EdgeEpisode:
     """One episode of one sensor. Places are in the frame of the odometry unless they are called map places.
 
-    ``sensor``: its place in the robot frame, and how far it moves between two samples, m (the detection may be late by
-    this distance). Less translation than ``half_base_m`` per radian counts as a turn in place. ``retreat_m``: how far
-    the sensor has moved since the edge was declared, while it stayed off.
+    ``offset_m``: the sensor's place in the robot frame; ``step_m``: how far it moves between two samples (the detection
+    may be late by this distance). Less translation than ``half_base_m`` per radian counts as a turn in place.
+    ``edge``: what was declared, or ``None``. ``retreat_m``: how far the sensor has moved since then while off.
     """
 
     def __init__(
@@ -62,51 +122,63 @@ class EdgeEpisode:
         limits: EdgeLimits,
         edge_map: EdgeMap,
         odometry: Odometry,
-        sensor: tuple[Place, float],
+        offset_m: Place,
+        *,
+        step_m: float,
         half_base_m: float,
     ) -> None:
-        self._limits, self._map = limits, edge_map
-        offset_m, moved_m = sensor
-        self._radius_m, self._half_base_m, self._moved_m = hypot(*offset_m), half_base_m, moved_m
-        c, s = cos(odometry.heading_rad), sin(odometry.heading_rad)
-        self._robot0: Place = (odometry.x_m, odometry.y_m)
-        self._sensor0: Place = (
-            odometry.x_m + c * offset_m[0] - s * offset_m[1],
-            odometry.y_m + s * offset_m[0] + c * offset_m[1],
-        )
-        self._heading0 = self._heading = odometry.heading_rad
-        self._map0: Place | None = None
-        self._cos, self._sin, self._sigma_m = 1.0, 0.0, inf
-        self._moved: Place = (0.0, 0.0)
-        self._recent: Place = (0.0, 0.0)
-        self._direction: Place = (0.0, 0.0)
-        self._axis: Axis = "x"
-        self._side = 0.0
-        self._has_switched = False
-        self._base: tuple[Place, Place] = ((0.0, 0.0), (0.0, 0.0))
-        self.is_from_turn = False
-        self._turn_sign = 0.0
-        self._off_samples = self._on_samples = 0
-        self._on_place: Place = self._sensor0
-        self._declared_heading = 0.0
-        self._declared_place: Place = self._sensor0
-        self._place: Place = self._sensor0
+        self._limits = limits
+        self._map = edge_map
+        self._radius_m = hypot(*offset_m)
+        self._step_m = step_m
+        self._half_base_m = half_base_m
+        self._start = _start(odometry, offset_m)
+        self._on_map: OnMap | None = None
+        # The newest sample off.
+        self._place = self._start.sensor
+        self._heading_rad = self._start.heading_rad
+        self._travel = _NO_TRAVEL
+        self._looked_at = _NO_TRAVEL.sensor
+        self._off_samples = 0
+        # The samples on since then.
+        self._on_place = self._start.sensor
+        self._on_samples = 0
+        # What is known once the sensor has moved.
+        self.phase = EdgePhase.FRESH
+        self._departure: Departure | None = None
+        self._seam: SeamCrossing | None = None
+        # What is known once an edge is declared.
+        self.edge: FoundEdge | None = None
+        self._declared_heading_rad = self._start.heading_rad
+        self._retreat_from = self._start.sensor
         self._is_turn_spent = False
         self.retreat_m = 0.0
         self.is_doubted = False
-        self.phase = EdgePhase.FRESH
-        self.cause: Condition = NO_SEAM  # valid once an edge is declared
-        self.value_m = self.limit_m = 0.0
 
     def place_on_map(self, place: Place, deck_heading_rad: float, sigma_m: float) -> None:
         """Set the sensor's place on the map, the robot's deck heading and the standard deviation of the estimate."""
-        turn = deck_heading_rad - self._heading0
-        self._map0, self._cos, self._sin, self._sigma_m = place, cos(turn), sin(turn), sigma_m
+        turn = deck_heading_rad - self._start.heading_rad
+        self._on_map = OnMap(place, cos(turn), sin(turn), sigma_m)
 
     @property
     def needs_map(self) -> bool:
         """Whether the sensor has no place on the map and has not moved since it went off."""
-        return self.phase is EdgePhase.FRESH and self._map0 is None
+        return self.phase is EdgePhase.FRESH and self._on_map is None
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the last sample was "on"; the episode may be about to end."""
+        return self._on_samples > 0
+
+    @property
+    def is_from_turn(self) -> bool:
+        """Whether a turn of the robot, not its translation, led the sensor off the panel."""
+        return self._departure is not None and self._departure.is_by_turn
+
+    @property
+    def permits_turn(self) -> bool:
+        """Whether the robot may turn. At a declared edge: only when a turn led there, to turn back."""
+        return self.edge is None or (self.is_from_turn and not self._is_turn_spent)
 
     # -- samples --------------------------------------------------------------------------------------------------
 
@@ -117,7 +189,7 @@ class EdgeEpisode:
         self._on_samples += 1
         if self._on_samples < self._limits.clear:
             return False
-        if self.phase is EdgePhase.DECLARED or self._on_samples >= LONG_ON * self._limits.clear:
+        if self.edge is not None or self._on_samples >= LONG_ON * self._limits.clear:
             return True
         return hypot(place[0] - self._on_place[0], place[1] - self._on_place[1]) >= self._limits.no_map_m
 
@@ -125,157 +197,178 @@ class EdgeEpisode:
         """Take an "off" sample; whether it declares an edge. ``worst_m``: largest unmeasured travel, rule (g)."""
         self._off_samples += 1
         self._on_samples = 0
-        self._heading, self._place = odometry.heading_rad, place
-        if self.phase is EdgePhase.DECLARED:
-            self._watch_turn()
-            self.retreat_m = hypot(place[0] - self._declared_place[0], place[1] - self._declared_place[1])
+        self._place = place
+        self._heading_rad = odometry.heading_rad
+        if self.edge is not None:
+            self._watch_retreat()
             return False
-        self._declared_place = place
-        if worst_m > self._limits.no_map_m:
-            return self._declare(OFF_WITHOUT_WHEELS, worst_m, self._limits.no_map_m)
-        c, s, sensor0, robot0 = self._cos, self._sin, self._sensor0, self._robot0
-        dx, dy = place[0] - sensor0[0], place[1] - sensor0[1]
-        self._moved = c * dx - s * dy, s * dx + c * dy
-        dx, dy = odometry.x_m - robot0[0], odometry.y_m - robot0[1]
-        robot = c * dx - s * dy, s * dx + c * dy
-        if self.phase is EdgePhase.FRESH:
-            self._classify(robot)
-        return self._judge(robot)
+        edge = self._judge_silence(worst_m)
+        if edge is None:
+            self._travel = self._travel_of(odometry, place)
+            if self.phase is EdgePhase.FRESH:
+                self._classify()
+            edge = self._judge()
+        if edge is None:
+            return False
+        second = self._second_seam() if edge.cause is BEYOND_SEAM else None
+        if second is not None:
+            self._seam = second
+            return False
+        self._declare(edge)
+        return True
 
     def look_ahead(self) -> bool:
         """Apply rule (a) along the motion since the last call. Returns whether it declares an edge."""
-        dx, dy = self._moved[0] - self._recent[0], self._moved[1] - self._recent[1]
+        on_map, now, before = self._on_map, self._travel.sensor, self._looked_at
+        dx, dy = now[0] - before[0], now[1] - before[1]
         length = hypot(dx, dy)
-        if self._on_samples or self._map0 is None or length < DIRECTION_TRAVEL_M or self.phase is EdgePhase.FRESH:
+        if self._on_samples or on_map is None or length < DIRECTION_TRAVEL_M:
             return False
-        self._recent = self._moved
-        if not self._is_rim((dx / length, dy / length)):
+        self._looked_at = now
+        if not self._is_rim_ahead(on_map, (dx / length, dy / length)):
             return False
         self.phase = EdgePhase.RIM
-        return self._off_samples >= self._limits.debounce and self._declare_rim()
+        if self._off_samples < self._limits.debounce:
+            return False
+        self._declare(self._judge_rim())
+        return True
 
     def trust(self) -> None:
         """A fix confirms that the sensor is correct: measure the retreat again, from here."""
-        self._declared_place, self.retreat_m, self.is_doubted = self._place, 0.0, False
+        self._retreat_from = self._place
+        self.retreat_m = 0.0
+        self.is_doubted = False
 
-    @property
-    def is_on(self) -> bool:
-        """Whether the last sample was "on"; the episode may be about to end."""
-        return self._on_samples > 0
+    def _declare(self, edge: FoundEdge) -> None:
+        self.edge = edge
+        self._declared_heading_rad = self._heading_rad
+        self._retreat_from = self._place
 
-    @property
-    def permits_turn(self) -> bool:
-        """Whether the robot may turn. At a declared edge: only when a turn led there, to turn back."""
-        return self.phase is not EdgePhase.DECLARED or (self.is_from_turn and not self._is_turn_spent)
+    def _watch_retreat(self) -> None:
+        """Update how far the sensor has moved since the edge was declared, and whether the robot turned on outwards."""
+        x, y = self._retreat_from
+        self.retreat_m = hypot(self._place[0] - x, self._place[1] - y)
+        if self._departure is not None:
+            outward_rad = self._departure.turn_sign * (self._heading_rad - self._declared_heading_rad)
+            self._is_turn_spent = self._is_turn_spent or outward_rad * self._radius_m > self._limits.outward_turn_m
 
-    # -- rules ----------------------------------------------------------------------------------------------------
+    # -- what the map shows ---------------------------------------------------------------------------------------
 
-    def _classify(self, robot: Place) -> None:
-        length = hypot(*self._moved)
+    def _travel_of(self, odometry: Odometry, place: Place) -> Travel:
+        start, on_map = self._start, self._on_map
+        c, s = (1.0, 0.0) if on_map is None else (on_map.cos, on_map.sin)
+        dx, dy = place[0] - start.sensor[0], place[1] - start.sensor[1]
+        sensor = c * dx - s * dy, s * dx + c * dy
+        dx, dy = odometry.x_m - start.robot[0], odometry.y_m - start.robot[1]
+        return Travel(sensor, (c * dx - s * dy, s * dx + c * dy))
+
+    def _classify(self) -> None:
+        """Find out, once the sensor has moved, how it left the panel and how the map explains it."""
+        (mx, my), on_map = self._travel.sensor, self._on_map
+        length = hypot(mx, my)
         if length < DIRECTION_TRAVEL_M:
             return
-        self._direction = direction = self._moved[0] / length, self._moved[1] / length
-        turned = self._heading - self._heading0
-        self.is_from_turn = hypot(*robot) < abs(turned) * self._half_base_m
-        self._turn_sign = 1.0 if turned >= 0.0 else -1.0
+        turned = self._heading_rad - self._start.heading_rad
+        is_by_turn = hypot(*self._travel.robot) < abs(turned) * self._half_base_m
+        self._departure = departure = Departure((mx / length, my / length), is_by_turn, 1.0 if turned >= 0.0 else -1.0)
         self.phase = EdgePhase.NO_MAP
-        if self._map0 is None:
+        if on_map is None:
             return
-        if self._is_rim(direction):
+        if self._is_rim_ahead(on_map, departure.direction):
             self.phase = EdgePhase.RIM
             return
-        seam = self._map.seam_at(self._map0, self._slack_m())
+        seam = self._map.seam_at(on_map.place, self._slack_m(on_map))
         if seam is not None:
             self.phase = EdgePhase.SEAM
-            self._set_seam(seam.axis)
+            self._seam = SeamCrossing(seam.axis, _side(departure, seam.axis), _NO_TRAVEL)
 
-    def _slack_m(self) -> float:
+    def _slack_m(self, on_map: OnMap) -> float:
         """Allowance across a seam, m. ``extra_m`` covers the heading's error: 3 mm are 1.3 deg at a corner sensor."""
         limits = self._limits
-        return limits.tolerance_m + limits.extra_m + limits.sigmas * self._sigma_m + self._moved_m
+        return limits.tolerance_m + limits.extra_m + limits.sigmas * on_map.sigma_m + self._step_m
 
-    def _is_rim(self, direction: Place) -> bool:
-        if self._map0 is None:
-            return False
-        here = self._map0[0] + self._moved[0], self._map0[1] + self._moved[1]
-        return self._map.is_rim_ahead(here, direction, self._limits.margin_m, self._limits.sigmas * self._sigma_m)
+    def _here(self, on_map: OnMap) -> Place:
+        """The sensor's map place now."""
+        return on_map.place[0] + self._travel.sensor[0], on_map.place[1] + self._travel.sensor[1]
 
-    def _set_seam(self, axis: Axis) -> None:
-        self._axis = axis
-        across = self._direction[0] if axis == "x" else self._direction[1]
-        # The direction tells forward from back only if the robot's translation, not a turn, brought the sensor here.
-        known = not self.is_from_turn and not self._has_switched and abs(across) >= MIN_SIDE_COSINE
-        self._side = (1.0 if across > 0.0 else -1.0) if known else 0.0
-
-    def _judge(self, robot: Place) -> bool:
-        if self._off_samples < self._limits.debounce:
-            return False
-        if self.phase is EdgePhase.RIM:
-            return self._declare_rim()
-        if self.phase is EdgePhase.NO_MAP:
-            return self._judge_no_map()
-        return self.phase is EdgePhase.SEAM and self._judge_seam(robot)
-
-    def _declare_rim(self) -> bool:
-        return self._declare(RIM_AHEAD, hypot(*self._moved), 0.0)
-
-    def _judge_no_map(self) -> bool:
-        ux, uy = self._direction
-        mx, my = self._moved
-        travel = hypot(max(ux * mx + uy * my, 0.0), ux * my - uy * mx)
-        return travel > self._limits.no_map_m and self._declare(NO_SEAM, travel, self._limits.no_map_m)
-
-    def _judge_seam(self, robot: Place) -> bool:
-        value, limit = self._seam_excess(robot)
-        if value <= limit or self._switch_seam(robot):
-            return False
-        return self._declare(BEYOND_SEAM, value, limit)
-
-    def _seam_excess(self, robot: Place) -> tuple[float, float]:
-        """Rule (b): the first travel that exceeds its limit, and that limit; else the translation and its limit."""
+    def _is_rim_ahead(self, on_map: OnMap, direction: Place) -> bool:
         limits = self._limits
-        k = 0 if self._axis == "x" else 1
-        width = limits.gap_m + limits.tolerance_m
-        sensor0, robot0 = self._base
-        across = self._moved[k] - sensor0[k]
-        across = across * self._side if self._side else abs(across)
-        if across > width + limits.extra_m:
-            return across, width + limits.extra_m
-        swept = abs(self._heading - self._heading0) * self._radius_m
-        if swept > limits.turn_m:
-            return swept, limits.turn_m
-        tx, ty = robot[0] - robot0[0], robot[1] - robot0[1]
-        if self._side and tx * self._direction[0] + ty * self._direction[1] <= 0.0:
-            return 0.0, width
-        travel = hypot(tx, ty)
-        if travel < width:
-            return travel, width
-        from_start = hypot(*robot)
-        if from_start > limits.crossing_m:
-            return from_start, limits.crossing_m
-        cosine = max(abs((tx, ty)[k]) / travel, limits.min_cosine)
-        return travel, width / cosine + limits.extra_m
+        here = self._here(on_map)
+        return self._map.is_rim_ahead(here, direction, limits.margin_m, limits.sigmas * on_map.sigma_m)
 
-    def _switch_seam(self, robot: Place) -> bool:
+    def _second_seam(self) -> SeamCrossing | None:
         """Where two seams cross, a sensor may leave one seam along the other. Once per episode this is not an edge."""
-        if self._has_switched or self._map0 is None or hypot(*robot) > self._limits.crossing_m:
-            return False
-        here = self._map0[0] + self._moved[0], self._map0[1] + self._moved[1]
-        seam = self._map.seam_at(here, self._slack_m(), not_axis=self._axis)
-        if seam is None:
-            return False
-        self._has_switched = True
-        self._base = (self._moved, robot)
-        self._set_seam(seam.axis)
-        return True
+        seam, on_map = self._seam, self._on_map
+        if seam is None or seam.is_second or on_map is None or hypot(*self._travel.robot) > self._limits.crossing_m:
+            return None
+        other = self._map.seam_at(self._here(on_map), self._slack_m(on_map), not_axis=seam.axis)
+        return None if other is None else SeamCrossing(other.axis, 0.0, self._travel, is_second=True)
 
-    def _declare(self, cause: Condition, value_m: float, limit_m: float) -> bool:
-        self.phase = EdgePhase.DECLARED
-        self.cause, self.value_m, self.limit_m = cause, value_m, limit_m
-        self._declared_heading = self._heading
-        return True
+    # -- rules: each judges the newest sample off, and changes nothing ---------------------------------------------
 
-    def _watch_turn(self) -> None:
-        outward = self._turn_sign * (self._heading - self._declared_heading) * self._radius_m
-        if outward > self._limits.outward_turn_m:
-            self._is_turn_spent = True
+    def _judge_silence(self, worst_m: float) -> FoundEdge | None:
+        """Rule (g)."""
+        limit_m = self._limits.no_map_m
+        return FoundEdge(OFF_WITHOUT_WHEELS, worst_m, limit_m) if worst_m > limit_m else None
+
+    def _judge(self) -> FoundEdge | None:
+        """Rules (a) to (c)."""
+        departure = self._departure
+        if departure is None or self._off_samples < self._limits.debounce:
+            return None
+        if self.phase is EdgePhase.RIM:
+            return self._judge_rim()
+        if self._seam is not None:
+            return self._judge_seam(departure, self._seam)
+        return self._judge_no_map(departure)
+
+    def _judge_rim(self) -> FoundEdge:
+        """Rule (a)."""
+        return FoundEdge(RIM_AHEAD, hypot(*self._travel.sensor), 0.0)
+
+    def _judge_no_map(self, departure: Departure) -> FoundEdge | None:
+        """Rule (c): motion back to where the sensor was on adds no travel."""
+        (ux, uy), (mx, my), limit_m = departure.direction, self._travel.sensor, self._limits.no_map_m
+        travel_m = hypot(max(ux * mx + uy * my, 0.0), ux * my - uy * mx)
+        return FoundEdge(NO_SEAM, travel_m, limit_m) if travel_m > limit_m else None
+
+    def _judge_seam(self, departure: Departure, seam: SeamCrossing) -> FoundEdge | None:
+        """Rule (b): the first travel that exceeds its limit."""
+        limits, travel, width_m = self._limits, self._travel, self._limits.width_m
+        k = 0 if seam.axis == "x" else 1
+        across = travel.sensor[k] - seam.begin.sensor[k]
+        across_m = across * seam.side if seam.side else abs(across)
+        if across_m > width_m + limits.extra_m:
+            return FoundEdge(BEYOND_SEAM, across_m, width_m + limits.extra_m)
+        swept_m = abs(self._heading_rad - self._start.heading_rad) * self._radius_m
+        if swept_m > limits.turn_m:
+            return FoundEdge(BEYOND_SEAM, swept_m, limits.turn_m)
+        tx, ty = travel.robot[0] - seam.begin.robot[0], travel.robot[1] - seam.begin.robot[1]
+        if seam.side and tx * departure.direction[0] + ty * departure.direction[1] <= 0.0:
+            return None
+        way_m = hypot(tx, ty)
+        if way_m < width_m:
+            return None
+        from_start_m = hypot(*travel.robot)
+        if from_start_m > limits.crossing_m:
+            return FoundEdge(BEYOND_SEAM, from_start_m, limits.crossing_m)
+        limit_m = width_m / max(abs((tx, ty)[k]) / way_m, limits.min_cosine) + limits.extra_m
+        return FoundEdge(BEYOND_SEAM, way_m, limit_m) if way_m > limit_m else None
+
+
+def _start(odometry: Odometry, offset_m: Place) -> Start:
+    x, y, heading_rad = odometry.x_m, odometry.y_m, odometry.heading_rad
+    c, s = cos(heading_rad), sin(heading_rad)
+    sensor = x + c * offset_m[0] - s * offset_m[1], y + s * offset_m[0] + c * offset_m[1]
+    return Start((x, y), sensor, heading_rad)
+
+
+def _side(departure: Departure, axis: Axis) -> float:
+    """The sign of the motion along an axis, 0: unknown.
+
+    The direction tells forward from back only if the robot's translation, not a turn, brought the sensor here.
+    """
+    along = departure.direction[0 if axis == "x" else 1]
+    if departure.is_by_turn or abs(along) < MIN_SIDE_COSINE:
+        return 0.0
+    return 1.0 if along > 0.0 else -1.0

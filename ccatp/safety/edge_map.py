@@ -6,6 +6,7 @@ from ccatp.core import DeckPose, PanelId
 from ccatp.mirror.mirror import Mirror
 
 Axis = Literal["x", "y"]
+Place = tuple[float, float]
 
 
 class SeamNear(NamedTuple):
@@ -23,13 +24,11 @@ class EdgeMap:
         self._rim = mirror.rim
         self.gap_m = mirror.gap_m
 
-    def place(self, pose: tuple[float, float, float], offset_m: tuple[float, float]) -> tuple[float, float]:
+    def place(self, pose: tuple[float, float, float], offset_m: Place) -> Place:
         """Deck (x, y) of a sensor at ``offset_m`` (robot frame) when the robot is at ``pose`` (x, y, heading)."""
         return self._mirror.body_offset(DeckPose(*pose), *offset_m)
 
-    def is_rim_ahead(
-        self, place: tuple[float, float], direction: tuple[float, float], reach_m: float, slack_m: float
-    ) -> bool:
+    def is_rim_ahead(self, place: Place, direction: Place, reach_m: float, slack_m: float) -> bool:
         """Whether the rim is within ``slack_m`` of the next ``reach_m`` from ``place`` along the unit ``direction``."""
         x, y = place
         if self._rim.signed_distance_m(x, y) > reach_m + slack_m:
@@ -37,15 +36,15 @@ class EdgeMap:
         ahead = x + reach_m * direction[0], y + reach_m * direction[1]
         return self._rim.segment_clearance_m(x, y, *ahead) <= slack_m
 
-    def is_beyond_rim(self, place: tuple[float, float]) -> bool:
+    def is_beyond_rim(self, place: Place) -> bool:
         """Whether a place is off the mirror."""
         return self._rim.signed_distance_m(*place) <= 0.0
 
-    def has_edge_near(self, place: tuple[float, float], slack_m: float) -> bool:
+    def has_edge_near(self, place: Place, slack_m: float) -> bool:
         """Whether a seam or the rim is within ``slack_m`` of a place."""
         return self._rim.signed_distance_m(*place) <= slack_m or self.seam_at(place, slack_m) is not None
 
-    def seam_at(self, place: tuple[float, float], slack_m: float, not_axis: Axis | None = None) -> SeamNear | None:
+    def seam_at(self, place: Place, slack_m: float, not_axis: Axis | None = None) -> SeamNear | None:
         """The nearest interior seam whose gap, widened by ``slack_m`` on both sides, contains a place.
 
         Seams of ``not_axis`` are left out.

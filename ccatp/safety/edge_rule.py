@@ -28,7 +28,7 @@ from ccatp.config.models import DangerConfig, RobotConfig
 from ccatp.core import EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim
-from ccatp.safety.edge_episode import EdgeEpisode, EdgeLimits, EdgePhase
+from ccatp.safety.edge_episode import EdgeEpisode, EdgeLimits
 from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.wheel_odometry import Odometry, WheelTrack, pose_at
 from ccatp.sensing.wheel_means import largest_rate_rad_s
@@ -97,7 +97,7 @@ class EdgeRule:
                 self._last_t_s = sample[0]
         # Rule (a) again, once per frame, for a sensor that is off and moves: a seam may lead to the rim.
         for i, episode in enumerate(self.episodes):
-            if episode is not None and episode.phase is not EdgePhase.DECLARED and episode.look_ahead():
+            if episode is not None and episode.edge is None and episode.look_ahead():
                 self.declared[i] += 1
         if estimate is not None and self._has_fix(self._odometry, estimate.sigma_m):
             self._review_after_fix(self._odometry, estimate)
@@ -142,7 +142,7 @@ class EdgeRule:
         """Rule (e), after a fix at rest."""
         limits = self._limits
         for i, episode in enumerate(self.episodes):
-            if episode is None or episode.phase is not EdgePhase.DECLARED or episode.is_on:
+            if episode is None or episode.edge is None or episode.is_on:
                 continue
             place = self._map.place((estimate.x_m, estimate.y_m, estimate.heading_rad), self._offsets[i])
             aside_m = _HEADING_RAD * hypot(*self._offsets[i])
@@ -169,8 +169,8 @@ class EdgeRule:
 
     def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: EstimateMessage | None) -> EdgeEpisode:
         ox, oy = self._offsets[i]
-        moved_m = (abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * hypot(ox, oy)) * dt_s
-        episode = EdgeEpisode(self._limits, self._map, odometry, ((ox, oy), moved_m), self._half_base_m)
+        step_m = (abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * hypot(ox, oy)) * dt_s
+        episode = EdgeEpisode(self._limits, self._map, odometry, (ox, oy), step_m=step_m, half_base_m=self._half_base_m)
         if estimate is not None:
             self._place(episode, (ox, oy), odometry, estimate)
         self.opened[i] += 1

@@ -11,7 +11,7 @@ import pytest
 
 from ccatp.conditions import BEYOND_SEAM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD, Condition
 from ccatp.config.load import load_config
-from ccatp.safety.edge_episode import DIRECTION_TRAVEL_M, LONG_ON, EdgeEpisode, EdgeLimits, EdgePhase
+from ccatp.safety.edge_episode import DIRECTION_TRAVEL_M, LONG_ON, EdgeEpisode, EdgeLimits, EdgePhase, FoundEdge
 from ccatp.safety.edge_map import Axis, EdgeMap, SeamNear
 from ccatp.safety.wheel_odometry import Odometry
 
@@ -68,9 +68,14 @@ class Sensor:
     def __post_init__(self) -> None:
         limits = EdgeLimits(self.gap_m, DANGER)
         edge_map = cast(EdgeMap, self.map)
-        self.episode = EdgeEpisode(limits, edge_map, self.odometry, (OFFSET, MOVED_M), HALF_BASE_M)
+        self.episode = EdgeEpisode(limits, edge_map, self.odometry, OFFSET, step_m=MOVED_M, half_base_m=HALF_BASE_M)
         if self.has_map:
             self.episode.place_on_map(MAP0, self.pose[2] + self.turn, SIGMA_M)
+
+    @property
+    def edge(self) -> FoundEdge:
+        assert self.episode.edge is not None
+        return self.episode.edge
 
     @property
     def odometry(self) -> Odometry:
@@ -111,14 +116,14 @@ def test_the_limits_are_those_of_the_configuration() -> None:
     assert width / cos(angle) > DANGER.slanted_crossing_m
     assert limits.min_cosine == cos(angle)
     assert limits.crossing_m == approx(width / cos(angle) + width / sin(angle) + DANGER.seam_extra_m)
-    assert (limits.gap_m, limits.tolerance_m, limits.extra_m) == (GAP_M, DANGER.gap_tolerance_m, DANGER.seam_extra_m)
+    assert (limits.width_m, limits.tolerance_m, limits.extra_m) == (width, DANGER.gap_tolerance_m, DANGER.seam_extra_m)
 
 
 def test_a_new_episode() -> None:
     sensor = Sensor(Map(is_rim=True), has_map=False)
     episode = sensor.episode
     assert episode.phase is EdgePhase.FRESH
-    assert (episode.value_m, episode.limit_m) == (0.0, 0.0)
+    assert episode.edge is None
     assert not episode.is_from_turn
     assert not episode.is_doubted
     assert not episode.is_on
@@ -162,8 +167,8 @@ def test_unheard_wheels_count_as_the_fastest() -> None:
     sensor = Sensor(Map(seams=("x",)))
     assert not sensor.off(0.0, worst_m=limit)
     assert sensor.off(0.0, worst_m=limit + UM)
-    assert sensor.episode.cause is OFF_WITHOUT_WHEELS
-    assert (sensor.episode.value_m, sensor.episode.limit_m) == (limit + UM, limit)
+    assert sensor.edge.cause is OFF_WITHOUT_WHEELS
+    assert (sensor.edge.value_m, sensor.edge.limit_m) == (limit + UM, limit)
 
 
 # -- ways off the panel -----------------------------------------------------------------------------------------------
@@ -275,8 +280,8 @@ def test_which_way_off_the_panel_is_an_edge(case: Ways) -> None:
     assert sensor.walk(*last) is (case.cause is not None)
     if case.cause is not None:
         assert not sensor.off(0.001)  # declared once
-        assert (sensor.episode.cause, sensor.episode.limit_m) == (case.cause, case.limit)
-        assert sensor.episode.value_m == case.value
+        assert (sensor.edge.cause, sensor.edge.limit_m) == (case.cause, case.limit)
+        assert sensor.edge.value_m == case.value
 
 
 def test_a_seam_is_left_along_another_once_which_is_asked_for_at_the_sensors_place() -> None:
@@ -285,7 +290,7 @@ def test_a_seam_is_left_along_another_once_which_is_asked_for_at_the_sensors_pla
     assert not sensor.walk(LIMIT_M, 0.3 * LIMIT_M, 60)  # 1 mm beyond what the first allows
     # The second allows what is left of both chords, and there is no third.
     assert sensor.walk(0.1, steps=200)
-    assert sensor.episode.cause is BEYOND_SEAM
+    assert sensor.edge.cause is BEYOND_SEAM
     ((x, y), slack_m, axis) = next(asked for asked in sensor.map.asked_seam if asked[2] is not None)
     assert len(sensor.map.asked_seam) == 2
     assert axis == "x"
@@ -362,8 +367,8 @@ def test_a_seam_may_lead_to_the_rim() -> None:
     sensor.off(0.0, -0.2 * DIRECTION_TRAVEL_M)
     assert sensor.episode.look_ahead()
     assert sensor.map.asked_rim[0][1] == approx((0.0, -1.0))
-    assert sensor.episode.cause is RIM_AHEAD
-    assert sensor.episode.value_m == approx(hypot(0.002, 1.1 * DIRECTION_TRAVEL_M))
+    assert sensor.edge.cause is RIM_AHEAD
+    assert sensor.edge.value_m == approx(hypot(0.002, 1.1 * DIRECTION_TRAVEL_M))
 
 
 def test_looking_ahead_goes_by_the_way_since_the_last_look() -> None:
@@ -382,7 +387,7 @@ def test_no_looking_ahead_while_on_or_without_a_place() -> None:
     sensor.map.is_rim = True
     assert not sensor.on(0.001)
     assert not sensor.episode.look_ahead()
-    assert sensor.episode.phase is not EdgePhase.DECLARED
+    assert sensor.episode.edge is None
     lost = Sensor(Map(is_rim=True), has_map=False)
     lost.off(0.001)
     lost.off(0.001)
@@ -396,7 +401,8 @@ def test_looking_ahead_waits_for_the_debounced_sample(early: int) -> None:
         sensor.off(0.001)
     sensor.map.is_rim = True
     assert sensor.episode.look_ahead() is not bool(early)
-    assert sensor.episode.phase is (EdgePhase.RIM if early else EdgePhase.DECLARED)
+    assert sensor.episode.phase is EdgePhase.RIM
+    assert (sensor.episode.edge is None) is bool(early)
     assert sensor.off(0.0) is bool(early)  # declared once
 
 
@@ -471,7 +477,7 @@ def test_what_a_turn_adds_counts_across_the_seam(sign: float, heading: float) ->
         across = sign * 0.001 + OFFSET[0] * (cos(turned) - 1.0) - OFFSET[1] * sin(turned)
         assert not sensor.off(turn=sign * 1e-4)
     assert sensor.walk(0.0, turn=sign * 0.01)
-    assert sensor.episode.value_m == approx(limit, abs=1e-4)
+    assert sensor.edge.value_m == approx(limit, abs=1e-4)
 
 
 def test_a_sensor_about_which_the_robot_turns_does_not_move() -> None:
@@ -514,6 +520,6 @@ def test_one_to_be_trusted_is_moved_back_from_where_it_is() -> None:
     sensor.episode.is_doubted = True
     sensor.episode.trust()
     assert (sensor.episode.is_doubted, sensor.episode.retreat_m) == (False, 0.0)
-    assert sensor.episode.phase is EdgePhase.DECLARED
+    assert sensor.episode.edge is not None
     sensor.off(0.0, 0.002)
     assert sensor.episode.retreat_m == approx(0.002)
