@@ -51,35 +51,35 @@ class DangerMonitor(SafetyRules):
         self._rim, self._robot, self._cfg, self._health = mirror.rim, robot, cfg, health
         self._map = EdgeMap(mirror)
         self._edges = EdgeRule(self._map, robot, cfg)
-        self._board: HealthMonitor | None = None
+        self._health_monitor: HealthMonitor | None = None
         if health is not None:
-            self._board = HealthMonitor(health, cfg, robot, mirror, self._is_explained)
+            self._health_monitor = HealthMonitor(health, cfg, robot, mirror, self._is_explained)
         super().__init__()
 
     def reset(self) -> None:
         """Begin a new session with the robot: its clock and numbers restart. Emergencies stay latched."""
         super().reset()
         self._edges.reset()
-        self._origin = CentreClearanceCheck(self._rim, self._robot, self._cfg)
+        self._centre_clearance = CentreClearanceCheck(self._rim, self._robot, self._cfg)
         self._time = SteadyTime(CLOCK_JUMP_S if self._health is None else self._health.clock_jump_s)
         self._edge_t_s: float | None = None
         self._frame_seq = self._state_seq = -1
         self._state = ""
         self._known: EstimateMessage | None = None
-        if self._board is not None and self._health is not None:
-            self._board.reset()
+        if self._health_monitor is not None and self._health is not None:
+            self._health_monitor.reset()
             self._escalation = SeverityEscalation(self._health)
         self.verdict = self.stale(-1, 0.0)
 
     def limit_wheels(self, max_wheel_rad_s: float) -> None:
         """Take the robot's own limit for the wheels' rates, after a reset."""
-        if self._board is not None:
-            self._board.limit_wheels(min(max_wheel_rad_s, self._robot.max_wheel_rad_s))
+        if self._health_monitor is not None:
+            self._health_monitor.limit_wheels(min(max_wheel_rad_s, self._robot.max_wheel_rad_s))
 
     @property
     def code(self) -> EventCode:
         """The event code now."""
-        if self._edges.is_lifted or self._origin.direction or self._declared() is not None:
+        if self._edges.is_lifted or self._centre_clearance.direction or self._declared() is not None:
             return EventCode.NEAR_EDGE
         return super().code
 
@@ -100,7 +100,7 @@ class DangerMonitor(SafetyRules):
         seq = sensors.seq
         if seq <= self._frame_seq:
             return self.stale(seq, sensors.t)
-        edges, origin, time, board = self._edges, self._origin, self._time, self._board
+        edges, clearance, time, health = self._edges, self._centre_clearance, self._time, self._health_monitor
         t_s = time.at(seq, sensors.t)
         sensors = self._with_possible_times(sensors, t_s)
         wheels: Sequence[WheelSample] = sensors.enc
@@ -115,7 +115,7 @@ class DangerMonitor(SafetyRules):
         self._frame_seq, self._state = seq, ""
         if known is not None:
             self._state, self._state_seq = known.state, known.seq
-            origin.step(t_s, known, wheels)
+            clearance.step(t_s, known, wheels)
         edges.step(samples, known)
         if samples:
             self._edge_t_s = samples[-1][0]
@@ -123,19 +123,19 @@ class DangerMonitor(SafetyRules):
         if lost is not None:
             missing = [*missing, lost]
         found: Sequence[MonitorFinding] = ()
-        if board is not None:
+        if health is not None:
             if known is None and estimate is not None and isfinite(estimate.t_s):
-                board.take_commands(estimate.t_s, estimate)
-            found = self._look(board, sensors, t_s, wheels, samples)
+                health.take_commands(estimate.t_s, estimate)
+            found = self._run_monitors(health, sensors, t_s, wheels, samples)
         self.found = ()
-        if not found and not missing and edges.is_idle and not origin.direction and not self.latch.is_latched:
+        if not found and not missing and edges.is_idle and not clearance.direction and not self.latch.is_latched:
             self.verdict = verdict = Verdict.normal(seq, sensors.t)
-            if board is not None and self._escalation.is_counting:
+            if health is not None and self._escalation.is_counting:
                 self._escalation.escalate(t_s, [])
         else:
             verdict = self._arbitrate(seq, sensors.t, missing)
-            if board is not None:
-                self.found = self._escalation.escalate(t_s, [*found, *self._own_findings(missing)])
+            if health is not None:
+                self.found = self._escalation.escalate(t_s, [*found, *self._rule_findings(missing)])
                 verdict = with_findings(verdict, self.found)
             self.verdict = verdict = self.latch.with_emergencies(verdict)
         return verdict
@@ -146,15 +146,15 @@ class DangerMonitor(SafetyRules):
         edge = possible_samples(frame.t, frame.edge)
         if imu is frame.imu and enc is frame.enc and edge is frame.edge:
             return frame
-        if self._board is not None:
-            self._board.misdated(t_s, frame)
+        if self._health_monitor is not None:
+            self._health_monitor.misdated(t_s, frame)
         return msgspec.structs.replace(frame, imu=imu, enc=enc, edge=edge)
 
     # -- monitors -------------------------------------------------------------------------------------------------
 
-    def _look(
+    def _run_monitors(
         self,
-        board: HealthMonitor,
+        health: HealthMonitor,
         sensors: Sensors,
         t_s: float,
         wheels: Sequence[WheelSample],
@@ -162,12 +162,12 @@ class DangerMonitor(SafetyRules):
     ) -> Sequence[MonitorFinding]:
         known, jump, last = self._known, self._time.jump, self.verdict
         if jump is not None and jump.seq == sensors.seq:
-            board.jumped(t_s, jump.by_s)
+            health.jumped(t_s, jump.by_s)
         if known is not None:
-            board.learn(known.t_s, known, self._edges.opened, self._edges.episodes)
+            health.learn(known.t_s, known, self._edges.opened, self._edges.episodes)
         is_permitted = last.forward and last.reverse and last.turn
-        board.step(t_s, sensors, wheels, samples, is_permitted=is_permitted, is_any_off=not self._edges.is_idle)
-        return board.findings
+        health.step(t_s, sensors, wheels, samples, is_permitted=is_permitted, is_any_off=not self._edges.is_idle)
+        return health.findings
 
     def _place(self, known: EstimateMessage, sensor: int) -> tuple[float, float]:
         pose = known.x_m, known.y_m, known.heading_rad
@@ -181,20 +181,20 @@ class DangerMonitor(SafetyRules):
         slack_m = cfg.gap_tolerance_m + cfg.seam_extra_m + cfg.map_sigmas * known.sigma_m
         return self._map.has_edge_near(self._place(known, sensor), slack_m)
 
-    def _own_findings(self, missing: Sequence[MonitorFinding]) -> list[MonitorFinding]:
+    def _rule_findings(self, missing: Sequence[MonitorFinding]) -> list[MonitorFinding]:
         found = [*missing]
         if self._health is None:
             return found
         if self._edges.is_lifted:
             found.append(conditions.LIFTED.found("edge", 4.0, 3.0))
         limit_m = self._health.stuck_off_m
-        self._doubt_sensors(limit_m)
+        self._suspect_sensors(limit_m)
         for i, episode in enumerate(self._edges.episodes):
-            if episode is not None and episode.is_doubted:
+            if episode is not None and episode.is_suspect:
                 found.append(conditions.EDGE_SENSOR_STAYS_OFF.found(CORNERS[i].value, episode.retreat_m, limit_m))
         return found
 
-    def _doubt_sensors(self, limit_m: float) -> None:
+    def _suspect_sensors(self, limit_m: float) -> None:
         """Doubt each sensor that stays off although the robot has left the edge, until its episode ends."""
         for i, episode in enumerate(self._edges.episodes):
             if episode is None or episode.edge is None or episode.retreat_m < limit_m:
@@ -203,7 +203,7 @@ class DangerMonitor(SafetyRules):
             others = (e is None or e is episode or e.is_on for e in self._edges.episodes)
             is_over_rim = known is not None and self._map.is_beyond_rim(self._place(known, i))
             if all(others) and not is_over_rim:
-                episode.is_doubted = True
+                episode.is_suspect = True
 
     # -- what is missing ------------------------------------------------------------------------------------------
 
@@ -214,7 +214,7 @@ class DangerMonitor(SafetyRules):
 
     def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
         """Count a line after frame ``seq`` that is not a frame. Too many give a verdict that permits no motion."""
-        found = None if self._board is None else self._board.garbled(at_s)
+        found = None if self._health_monitor is None else self._health_monitor.garbled(at_s)
         return None if found is None else self._denied(seq, t_s, found)
 
     def _denied(self, seq: int, t_s: float, finding: MonitorFinding) -> Verdict:
@@ -259,7 +259,7 @@ class DangerMonitor(SafetyRules):
             permits = row.motion.permits()
             return Verdict(seq, t_s, row.code, row.because(), "edge", 4.0, 3.0, *permits, off=EVERYWHERE)
         declared = self._declared()
-        if declared is not None or self._origin.direction:
+        if declared is not None or self._centre_clearance.direction:
             return self._edge_verdict(seq, t_s, declared, missing)
         if missing is not None:
             return self._denied(seq, t_s, missing)
@@ -269,7 +269,7 @@ class DangerMonitor(SafetyRules):
     def _edge_verdict(
         self, seq: int, t_s: float, declared: FoundEdge | None, missing: MonitorFinding | None
     ) -> Verdict:
-        origin, barred = self._origin, self._origin.direction
+        clearance, barred = self._centre_clearance, self._centre_clearance.direction
         if declared is not None:
             a, b, c, d = (e is not None and e.edge is not None for e in self._edges.episodes)
             off, turn = (a, b, c, d), not barred and all(e is None or e.permits_turn for e in self._edges.episodes)
@@ -278,7 +278,7 @@ class DangerMonitor(SafetyRules):
         else:
             off, turn = (barred > 0, barred > 0, barred < 0, barred < 0), False
             row, signal = conditions.CENTRE_NEAR_RIM, "estimate"
-            value, limit = origin.clearance_m, origin.limit_m
+            value, limit = clearance.clearance_m, clearance.limit_m
         forward, reverse = barred <= 0 and not (off[0] or off[1]), barred >= 0 and not (off[2] or off[3])
         cause, permits = row.because(), row.motion.permits(Permits(forward, reverse, turn))
         if missing is not None:

@@ -153,7 +153,7 @@ class EdgeEpisode:
         self._retreat_from = self._start.sensor
         self._is_turn_spent = False
         self.retreat_m = 0.0
-        self.is_doubted = False
+        self.is_suspect = False
 
     def place_on_map(self, place: Place, deck_heading_rad: float, sigma_m: float) -> None:
         """Set the sensor's place on the map, the robot's deck heading and the standard deviation of the estimate."""
@@ -233,11 +233,11 @@ class EdgeEpisode:
         self._declare(self._judge_rim())
         return True
 
-    def trust(self) -> None:
+    def confirm(self) -> None:
         """A fix confirms that the sensor is correct: measure the retreat again, from here."""
         self._retreat_from = self._place
         self.retreat_m = 0.0
-        self.is_doubted = False
+        self.is_suspect = False
 
     def _declare(self, edge: FoundEdge) -> None:
         self.edge = edge

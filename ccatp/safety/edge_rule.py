@@ -69,7 +69,7 @@ class EdgeRule:
         self._odometry: Odometry | None = None
         self._last_t_s: float | None = None
         self._all_off = self._all_on = 0
-        self._vague_m = 0.0
+        self._largest_sigma_m = 0.0
         self.is_lifted = False
 
     @property
@@ -134,8 +134,8 @@ class EdgeRule:
 
     def _has_fix(self, odometry: Odometry, sigma_m: float) -> bool:
         is_still = abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * self._half_base_m < _STILL_M_S
-        has_fix = is_still and sigma_m < _BY_A_FIX * self._vague_m
-        self._vague_m = max(self._vague_m, sigma_m) if is_still and not has_fix else sigma_m
+        has_fix = is_still and sigma_m < _BY_A_FIX * self._largest_sigma_m
+        self._largest_sigma_m = max(self._largest_sigma_m, sigma_m) if is_still and not has_fix else sigma_m
         return has_fix
 
     def _review_after_fix(self, odometry: Odometry, estimate: EstimateMessage) -> None:
@@ -150,7 +150,7 @@ class EdgeRule:
             seam = self._map.seam_at(place, limits.tolerance_m + slack_m)
             is_rim = self._map.is_rim_ahead(place, (1.0, 0.0), 0.0, limits.margin_m + slack_m)
             if is_rim:
-                episode.trust()
+                episode.confirm()
             elif seam is not None:
                 opened = self._open(i, odometry, 0.0, estimate)
                 self._place(opened, self._offsets[i], odometry, estimate, aside_m / limits.sigmas)

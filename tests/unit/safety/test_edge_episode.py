@@ -125,7 +125,7 @@ def test_a_new_episode() -> None:
     assert episode.phase is EdgePhase.FRESH
     assert episode.edge is None
     assert not episode.is_from_turn
-    assert not episode.is_doubted
+    assert not episode.is_suspect
     assert not episode.is_on
     assert episode.retreat_m == 0.0
     assert episode.permits_turn
@@ -514,12 +514,12 @@ def test_one_to_be_trusted_is_moved_back_from_where_it_is() -> None:
     sensor = Sensor(Map(is_rim=True))
     sensor.off(0.001)
     assert sensor.off(0.001)
-    sensor.episode.trust()
+    sensor.episode.confirm()
     sensor.off(-0.003, -0.004)
     assert sensor.episode.retreat_m == approx(0.005)
-    sensor.episode.is_doubted = True
-    sensor.episode.trust()
-    assert (sensor.episode.is_doubted, sensor.episode.retreat_m) == (False, 0.0)
+    sensor.episode.is_suspect = True
+    sensor.episode.confirm()
+    assert (sensor.episode.is_suspect, sensor.episode.retreat_m) == (False, 0.0)
     assert sensor.episode.edge is not None
     sensor.off(0.0, 0.002)
     assert sensor.episode.retreat_m == approx(0.002)

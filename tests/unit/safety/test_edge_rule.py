@@ -298,10 +298,10 @@ def test_the_map_is_asked_with_the_slack_of_fix_and_heading(rule: Rule, cfg: Con
 def test_one_that_a_fix_shows_at_the_rim_is_not_to_blame_for_staying_off(rule: Rule) -> None:
     episode = declared(rule)
     assert episode.retreat_m > 0.007
-    episode.is_doubted = rule.map.is_rim = True
+    episode.is_suspect = rule.map.is_rim = True
     assert measured(rule, 4.9e-4) is episode
     assert episode.edge is not None
-    assert not episode.is_doubted
+    assert not episode.is_suspect
     # From here on the way back counts anew.
     assert episode.retreat_m == 0.0
     rule.feed([OFF_FL] * 50, v=-0.1)
@@ -310,9 +310,9 @@ def test_one_that_a_fix_shows_at_the_rim_is_not_to_blame_for_staying_off(rule: R
 
 def test_where_a_fix_shows_neither_it_is_to_blame(rule: Rule) -> None:
     episode = declared(rule)
-    episode.is_doubted = True
+    episode.is_suspect = True
     assert measured(rule, 4.9e-4) is episode
-    assert episode.is_doubted
+    assert episode.is_suspect
     assert episode.retreat_m > 0.007
 
 
