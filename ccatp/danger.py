@@ -11,9 +11,9 @@ precedes normal operation (0). The cause is that of the most restrictive rule.
 * An emergency: code 2, latched, motion permitted because the robot shall drive home
   (``ccatp.safety.emergency_latch``). In an earthquake no motion is permitted until it is cleared.
 
-The monitors of ``ccatp.safety.monitor`` check every frame. Each finding of a frame counts: any one that holds the
-wheels denies all motion, and that of the highest severity gives the verdict its severity and its cause. A declared edge
-keeps its code, and its cause as long as nothing holds the wheels.
+The monitors of ``ccatp.safety.health_monitor`` check every frame. Each finding of a frame counts: any one that holds
+the wheels denies all motion, and that of the highest severity gives the verdict its severity and its cause. A declared
+edge keeps its code, and its cause as long as nothing holds the wheels.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ from ccatp.safety.edge_episode import FoundEdge
 from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
-from ccatp.safety.monitor import HealthMonitor
+from ccatp.safety.health_monitor import HealthMonitor
 from ccatp.safety.rules import SafetyRules
 from ccatp.sensing.sample_times import possible_samples
 

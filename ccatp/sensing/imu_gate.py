@@ -13,7 +13,7 @@ class ImuGate:
     """Rejects the inertial unit while its readings are impossible, and for a quarantine time afterwards.
 
     Impossible are: an acceleration or rate that the robot cannot reach; a rate that jumps away from that of the wheels
-    (``ccatp.safety.wheel_monitors`` judges a slow drift); exact repetition by a unit that has shown noise at rest.
+    (``ccatp.safety.wheel_monitor`` judges a slow drift); exact repetition by a unit that has shown noise at rest.
     While the unit is used, ``cause`` is empty and ``out_since_s`` infinite.
     """
 

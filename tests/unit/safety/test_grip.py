@@ -22,7 +22,7 @@ from ccatp.danger import DangerMonitor
 from ccatp.dataloop import motor_robot
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import SeverityEscalation
-from ccatp.safety.wheel_monitors import GripMonitor
+from ccatp.safety.grip_monitor import GripMonitor
 from ccatp.sensing.wheel_means import WheelMeans
 from ccatp.slide_rule import SlideRule
 

@@ -4,9 +4,9 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.core import EmergencyKind
+from ccatp.safety.edge_monitors import SeamMonitor
 from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, EmergencyLatch
-from ccatp.safety.sensor_monitors import SeamMonitor
-from ccatp.safety.wheel_monitors import WheelMonitor
+from ccatp.safety.wheel_monitor import WheelMonitor
 from ccatp.survey.events import MissionState
 from tests.support.scenario import mirror_of
 

@@ -11,20 +11,15 @@ from ccatp.core import EdgeSample, ImuSample, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
+from ccatp.safety.edge_monitors import FlickerMonitor, SeamMonitor
 from ccatp.safety.escalation import FindingLatch
+from ccatp.safety.grip_monitor import GripMonitor
+from ccatp.safety.link_monitors import LatencyMonitor
 from ccatp.safety.motion_sums import MotionSum
-from ccatp.safety.sensor_monitors import (
-    FANS,
-    REPORTED,
-    BatteryMonitor,
-    FanMonitor,
-    FlickerMonitor,
-    LatencyMonitor,
-    RateMonitor,
-    SeamMonitor,
-)
+from ccatp.safety.rate_monitor import RateMonitor
+from ccatp.safety.robot_state_monitors import FANS, REPORTED, BatteryMonitor, FanMonitor
 from ccatp.safety.speed_ratio import SpeedRatioMonitor
-from ccatp.safety.wheel_monitors import LATE_S, GripMonitor, WheelMonitor
+from ccatp.safety.wheel_monitor import LATE_S, WheelMonitor
 from ccatp.sensing.imu_gate import ImuGate
 from ccatp.sensing.sample_times import LATEST_S, OLDEST_S, worst_offset_s
 from ccatp.sensing.wheel_means import WheelMeans

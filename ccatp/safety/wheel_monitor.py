@@ -1,4 +1,4 @@
-"""Monitors of wheels and encoders against the set points and the gyroscope, and of the wheels' grip."""
+"""Monitors of wheels and encoders against the set points and the gyroscope."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -6,11 +6,9 @@ from typing import NamedTuple
 
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.core import GravitySample, ImuSample, WheelSample
+from ccatp.core import WheelSample
 from ccatp.safety.escalation import FindingLatch, Since
 from ccatp.safety.motion_sums import MotionSum, SlidingWindow
-from ccatp.sensing.wheel_means import WheelMeans
-from ccatp.slide_rule import SlideRule
 
 # After this time a command has less than 2 % effect on a wheel (servo 0.1 s, link 40 ms).
 _MEMORY_S = 0.4
@@ -226,85 +224,6 @@ class WheelMonitor:
         limit = vagueness * (cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope)))
         if not -limit <= difference <= limit:
             self.yaw.see(t_s, conditions.YAW_DISAGREES.found("imu_wz", difference, limit))
-
-
-_GRAVITY_TIME_S = 0.2  # time constant of the average of the noisy gravity samples
-_STILL_RAD_S = 0.05  # on a slope a held wheel turns more slowly than this
-_HOLDS = 1.05  # full thrust over the least; below this the robot may slide anywhere
-_REPORTED_CONTACTS = 20.0  # a slide of 1.2 s has up to 19
-
-
-class GripMonitor:
-    """Finds loss of grip (the body moves downhill faster than its wheels) and too little grip (by the creep of turns).
-
-    Loss of grip: the forward acceleration less its bias at rest is compared with the change of the wheels' speed, and
-    the gyroscope with the wheels' turn; or the robot reports it. ``finding``: about the margin that main measures;
-    ``noise``: about an accelerometer of single differences.
-    """
-
-    def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
-        self._rule, self._radius_m = SlideRule(cfg.grip_slip_m_s, cfg.grip_turn_rad), robot.wheel_radius_m
-        self._per_base = robot.wheel_radius_m / robot.wheel_base_m
-        self.alarm = FindingLatch(cfg.retry_after_s)
-        self._least_margin = robot.thrust_margin
-        self.finding: conditions.MonitorFinding | None = None
-        self.noise: conditions.MonitorFinding | None = None
-        self._ahead = self._bias_m_s2 = self._speed_m_s = 0.0
-        self._rested = 0
-
-    def take_margin(self, margin: float) -> None:
-        """Take main's margin: full thrust over the least that holds the robot everywhere; 0: not measured."""
-        is_short, is_held = 0.0 < margin < 0.999 * self._least_margin, margin >= _HOLDS
-        condition = conditions.GRIP_LITTLE if is_held else conditions.GRIP_TOO_LITTLE
-        least = self._least_margin if is_held else _HOLDS
-        self.finding = condition.found("grip", margin, least) if is_short else None
-
-    def step(
-        self,
-        t_s: float,
-        dt_s: float,
-        imu: Sequence[ImuSample],
-        means: WheelMeans,
-        gravity: GravitySample | None,
-        bias_rad_s: float,
-    ) -> bool:
-        """Take a frame; returns whether the robot slides. ``bias_rad_s``: of the gyroscope."""
-        rule = self._rule
-        if gravity is not None:
-            self._ahead += 0.05 / (_GRAVITY_TIME_S + 0.05) * (gravity[1] - self._ahead)
-        right, left = means.right_rad_s, means.left_rad_s
-        if not imu or right is None or left is None:
-            return False
-        _, ax, wz = imu[-1]
-        speed_m_s, before_m_s = 0.5 * self._radius_m * (right + left), self._speed_m_s
-        self._speed_m_s = speed_m_s
-        change_m_s = speed_m_s - before_m_s
-        is_sound = rule.is_possible(ax) and abs(change_m_s) < rule.WHEEL_JUMP_M_S
-        is_still = -_STILL_RAD_S < right < _STILL_RAD_S and -_STILL_RAD_S < left < _STILL_RAD_S
-        if is_still and self._rested < rule.BIAS_SAMPLES and is_sound:
-            self._rested += 1
-            self._bias_m_s2 += (ax - self._bias_m_s2) / self._rested
-        if not is_sound or self._rested < rule.BIAS_SAMPLES or not 0.0 < dt_s < rule.MEMORY_S:
-            rule.reset()
-            return False
-        # The link carries only the forward component of the acceleration.
-        side = 1.0 if self._ahead >= rule.LEAST_SLOPE else -1.0 if self._ahead <= -rule.LEAST_SLOPE else 0.0
-        turned_rad = (wz - bias_rad_s - self._per_base * (right - left)) * dt_s
-        slid_m_s = rule.step(dt_s, (ax - self._bias_m_s2) * dt_s - change_m_s, 0.0, turned_rad, (side, 0.0))
-        self._judge_noise()
-        return slid_m_s > 0.0 and self.report(t_s, slid_m_s)
-
-    def _judge_noise(self) -> None:
-        contacts = self._rule.contacts
-        if contacts < SlideRule.CONTACTS:
-            self.noise = None
-        elif contacts > _REPORTED_CONTACTS:
-            self.noise = conditions.ACCELEROMETER_DIFFERENCES.found("accelerometer", contacts, _REPORTED_CONTACTS)
-
-    def report(self, t_s: float, slid_m_s: float) -> bool:
-        """Report that the robot slides downhill at ``slid_m_s``, by this rule or by the robot's own."""
-        self.alarm.see(t_s, conditions.GRIP_LOST.found("grip", slid_m_s, self._rule.limit_m_s))
-        return True
 
 
 def _what_is_broken(samples: Sequence[WheelSample], side: int) -> str:
