@@ -10,6 +10,7 @@ from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import Corner, DeckPose, EdgeSample, PanelId
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import FindingLatch
+from ccatp.safety.monitor import Monitor
 
 _CORNERS = tuple(corner.value for corner in Corner)
 
@@ -21,7 +22,7 @@ _STILL_M_S = 0.002
 _CLEAR_S = 0.2
 
 
-class FlickerMonitor:
+class FlickerMonitor(Monitor):
     """Judges the transitions of the edge sensors, in frames in which a sensor is off or was off a moment ago.
 
     * More transitions than allowed in a short time, where the map has no edge of a panel: chatter, a hold.
@@ -33,8 +34,16 @@ class FlickerMonitor:
     """
 
     def __init__(self, cfg: HealthConfig, is_explained: Callable[[int], bool]) -> None:
-        self._cfg, self._is_explained = cfg, is_explained
-        self.chatter, self.flash = FindingLatch(cfg.retry_after_s), FindingLatch(_CLEAR_S)
+        super().__init__()
+        self._cfg = cfg
+        self._is_explained = is_explained
+        self.chatter = self.latch(cfg.retry_after_s)
+        self.flash = self.latch(_CLEAR_S)
+        self.reset()
+
+    def reset(self) -> None:
+        """See ``Monitor``."""
+        super().reset()
         self._last: tuple[int, ...] = (1, 1, 1, 1)
         self._changes: tuple[deque[float], ...] = (deque(), deque(), deque(), deque())
         self._flashing_s: list[float | None] = [None, None, None, None]
@@ -83,7 +92,7 @@ class FlickerMonitor:
             self.flash.finding = self.flash.finding._replace(condition=condition, severity=condition.severity)
 
 
-class SeamMonitor:
+class SeamMonitor(Monitor):
     """Counts the seams that each edge sensor crossed without going off: every seam is a proof test.
 
     A sensor is certainly on a panel if the map shows it further inside than the error of the estimate. If it is then on
@@ -92,28 +101,37 @@ class SeamMonitor:
     """
 
     def __init__(self, cfg: HealthConfig, mirror: Mirror, robot: RobotConfig, sigmas: float) -> None:
-        self._cfg, self._mirror, self._sensors_m, self._sigmas = cfg, mirror, robot.edge_sensors_m, sigmas
+        super().__init__()
+        self._cfg = cfg
+        self._mirror = mirror
+        self._sensors_m = robot.edge_sensors_m
+        self._sigmas = sigmas
         self._fastest_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
         self._reach_m = max(hypot(*offset_m) for offset_m in robot.edge_sensors_m)
         self.missed = [0, 0, 0, 0]
-        self._blind = FindingLatch(cfg.retry_after_s)
+        self._blind = FindingLatch(cfg.retry_after_s)  # settles with the estimates, and stays after a reset
         self.reset()
 
     def reset(self) -> None:
         """Drop the places of the sensors; keep the numbers of missed seams."""
+        super().reset()
         self._panels: list[PanelId | None] = [None, None, None, None]
         self._seen = [False, False, False, False]
         self._pose: tuple[float, float, float, float] | None = None
         self._inside_m = 0.0  # lower bound of the distance of all sensors from their panels' edges; 0: look up again
+
+    def findings(self, t_s: float) -> list[MonitorFinding]:
+        """See ``Monitor``."""
+        return [*super().findings(t_s), *([] if self.finding is None else [self.finding])]
 
     def went_off(self, sensor: int) -> None:
         """Report that a sensor went off or is off: it is not blind."""
         self._seen[sensor] = True
         self.missed[sensor] = 0
 
-    def step(self, t_s: float, pose: tuple[float, float, float], sigma_m: float) -> None:
-        """Take a new estimate: its time, (x, y, heading) in the deck frame, standard deviation of the position."""
-        x, y, heading = pose
+    def step(self, t_s: float, pose: DeckPose, sigma_m: float) -> None:
+        """Take a new estimate: its time, pose, and standard deviation of the position."""
+        x, y, heading = pose.x_m, pose.y_m, pose.heading_rad
         self._blind.settle(t_s)
         before, self._pose = self._pose, (t_s, x, y, heading)
         margin_m = self._cfg.seam_margin_m + self._sigmas * sigma_m
@@ -127,7 +145,7 @@ class SeamMonitor:
             if margin_m < self._inside_m and moved_m <= reach_m:
                 return
         least_m = inf
-        hx, hy, lx, ly = self._mirror.body_axes(DeckPose(x, y, heading))
+        hx, hy, lx, ly = self._mirror.body_axes(pose)
         for i, (ox, oy) in enumerate(self._sensors_m):
             found, inside_m = self._panel_under(x + ox * hx + oy * lx, y + ox * hy + oy * ly)
             least_m = min(least_m, inside_m)

@@ -18,7 +18,12 @@ class FindingLatch:
     __slots__ = ("_clear_s", "_seen_s", "finding")
 
     def __init__(self, clear_s: float) -> None:
-        self._clear_s, self._seen_s = clear_s, -inf
+        self._clear_s = clear_s
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop the finding."""
+        self._seen_s = -inf
         self.finding: MonitorFinding | None = None
 
     def see(self, t_s: float, finding: MonitorFinding) -> None:

@@ -5,23 +5,17 @@ from collections.abc import Sequence
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import GravitySample, ImuSample
-from ccatp.safety.escalation import FindingLatch
+from ccatp.safety.monitor import Monitor
 from ccatp.sensing.wheel_means import WheelMeans
 from ccatp.slide_rule import SlideRule
 
 _GRAVITY_TIME_S = 0.2  # time constant of the average of the noisy gravity samples
-
-
 _STILL_RAD_S = 0.05  # on a slope a held wheel turns more slowly than this
-
-
 _HOLDS = 1.05  # full thrust over the least; below this the robot may slide anywhere
-
-
 _REPORTED_CONTACTS = 20.0  # a slide of 1.2 s has up to 19
 
 
-class GripMonitor:
+class GripMonitor(Monitor):
     """Finds loss of grip (the body moves downhill faster than its wheels) and too little grip (by the creep of turns).
 
     Loss of grip: the forward acceleration less its bias at rest is compared with the change of the wheels' speed, and
@@ -30,14 +24,29 @@ class GripMonitor:
     """
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
-        self._rule, self._radius_m = SlideRule(cfg.grip_slip_m_s, cfg.grip_turn_rad), robot.wheel_radius_m
+        super().__init__()
+        self._slip_m_s = cfg.grip_slip_m_s
+        self._turn_rad = cfg.grip_turn_rad
+        self._radius_m = robot.wheel_radius_m
         self._per_base = robot.wheel_radius_m / robot.wheel_base_m
-        self.alarm = FindingLatch(cfg.retry_after_s)
         self._least_margin = robot.thrust_margin
+        self.alarm = self.latch(cfg.retry_after_s)
+        self.reset()
+
+    def reset(self) -> None:
+        """See ``Monitor``."""
+        super().reset()
+        self._rule = SlideRule(self._slip_m_s, self._turn_rad)
         self.finding: conditions.MonitorFinding | None = None
         self.noise: conditions.MonitorFinding | None = None
-        self._ahead = self._bias_m_s2 = self._speed_m_s = 0.0
+        self._ahead = 0.0
+        self._bias_m_s2 = 0.0
+        self._speed_m_s = 0.0
         self._rested = 0
+
+    def findings(self, t_s: float) -> list[conditions.MonitorFinding]:
+        """See ``Monitor``."""
+        return [*super().findings(t_s), *(one for one in (self.finding, self.noise) if one is not None)]
 
     def take_margin(self, margin: float) -> None:
         """Take main's margin: full thrust over the least that holds the robot everywhere; 0: not measured."""

@@ -1,9 +1,20 @@
 """Changes of travel and turn over a period."""
 
 from collections import deque
+from typing import NamedTuple
 
-MotionSum = tuple[float, float, float, float]
-"""Time, s; sums since the start: travel of right and left wheel, m, turn by the gyroscope where plausible, rad."""
+
+class MotionSum(NamedTuple):
+    """Travel of the wheels, and turn by the gyroscope where plausible: sums since the start at ``t_s``, or changes."""
+
+    t_s: float
+    right_m: float
+    left_m: float
+    turned_rad: float
+
+    def of(self, side: int) -> float:
+        """Travel of one wheel: 0 for the right one, 1 for the left one."""
+        return self[1 + side]
 
 
 class SlidingWindow:
@@ -21,11 +32,11 @@ class SlidingWindow:
 
     def push(self, now: MotionSum) -> MotionSum | None:
         """Take the newest sums; returns the change over the period, with its length, ``None`` while it is too short."""
-        kept, since_s = self._kept, now[0] - self._span_s
+        kept, since_s = self._kept, now.t_s - self._span_s
         kept.append(now)
         while len(kept) > 1 and kept[1][0] <= since_s:
             kept.popleft()
         t_s, right_m, left_m, turned_rad = kept[0]
         if t_s > since_s:
             return None
-        return now[0] - t_s, now[1] - right_m, now[2] - left_m, now[3] - turned_rad
+        return MotionSum(now.t_s - t_s, now.right_m - right_m, now.left_m - left_m, now.turned_rad - turned_rad)

@@ -3,18 +3,25 @@
 from ccatp import conditions
 from ccatp.conditions import SAMPLE_RATES, MonitorFinding
 from ccatp.config.models import HealthConfig
+from ccatp.safety.monitor import Monitor
 
 _SOURCES = ("imu", "enc", "edge")
 
 
-class RateMonitor:
+class RateMonitor(Monitor):
     """Compares the sample rate of each sensor with the required rate and with the rate of the first period.
 
     ``finding``: about the worst sensor. A sensor without any samples is left out, because other rules report it.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
+        super().__init__()
         self._cfg = cfg
+        self.reset()
+
+    def reset(self) -> None:
+        """See ``Monitor``."""
+        super().reset()
         self.finding: MonitorFinding | None = None
         self.are_encoders_sparse = False
         self._begin_s: float | None = None
@@ -22,6 +29,10 @@ class RateMonitor:
         self._counts = [0, 0, 0]
         self._usual_hz: list[float] | None = None
         self._before_hz: list[float] = []
+
+    def findings(self, t_s: float) -> list[MonitorFinding]:
+        """See ``Monitor``."""
+        return [*super().findings(t_s), *([] if self.finding is None else [self.finding])]
 
     def step(self, t_s: float, imu: int, encoders: int, edges: int) -> None:
         """Take the numbers of samples of a frame; judged once per ``rate_time_s``."""

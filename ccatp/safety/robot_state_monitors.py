@@ -6,6 +6,7 @@ from ccatp import conditions
 from ccatp.conditions import MonitorFinding
 from ccatp.config.models import HealthConfig
 from ccatp.safety.escalation import FindingLatch, Since
+from ccatp.safety.monitor import Monitor
 
 # A fan command is in force at the latest two link delays after it was sent.
 _FIRST_COMMAND_S = 1.0
@@ -20,10 +21,12 @@ REPORTED = {
 }
 
 
-FANS, _SIDES = ("fan_left", "fan_right"), ("left", "right")
+FANS = ("fan_left", "fan_right")
+BATTERY_LOW = "battery_low"
+_SIDES = ("left", "right")
 
 
-class FanMonitor:
+class FanMonitor(Monitor):
     """Compares the echo of the fans' duties with the commanded ``duty`` (left, right), where the mirror overhangs.
 
     The echo is only a set point. Thrust and rotation are not on the link, so the robot itself has to report a fan that
@@ -31,10 +34,17 @@ class FanMonitor:
     """
 
     def __init__(self, cfg: HealthConfig, duty: tuple[float, float], overhang: bool) -> None:
-        self._cfg, self._overhang = cfg, overhang
+        super().__init__()
+        self._cfg = cfg
+        self._overhang = overhang
         self._enough = cfg.fan_early_share * duty[0], cfg.fan_early_share * duty[1]
         self._least = cfg.fan_share * duty[0], cfg.fan_share * duty[1]
-        self.alarm = FindingLatch(cfg.retry_after_s)
+        self.alarm = self.latch(cfg.retry_after_s)
+        self.reset()
+
+    def reset(self) -> None:
+        """See ``Monitor``."""
+        super().reset()
         self._low, self._weak = Since(), Since()
         self._first_s: float | None = None
         self._was_right = False
@@ -68,17 +78,23 @@ class FanMonitor:
         self._sound = None if is_low or is_weak else fans
 
 
-class BatteryMonitor:
+class BatteryMonitor(Monitor):
     """Checks that the charge is enough for the way home. A finding stays, because the battery does not recharge."""
 
     def __init__(self, cfg: HealthConfig) -> None:
+        super().__init__()
         self._cfg = cfg
         self.finding: MonitorFinding | None = None
         self.reset()
 
     def reset(self) -> None:
-        """Begin the durations again, because the robot's clock has restarted."""
+        """Begin the durations again; the finding stays."""
+        super().reset()
         self._low, self._reported = Since(), Since()
+
+    def findings(self, t_s: float) -> list[MonitorFinding]:
+        """See ``Monitor``."""
+        return [*super().findings(t_s), *([] if self.finding is None else [self.finding])]
 
     def step(self, t_s: float, soc: float, is_reported: bool, home_m: float) -> None:
         """Judge a frame; ``soc`` from 0 to 1, ``home_m``: length of the way home."""
@@ -89,3 +105,36 @@ class BatteryMonitor:
             self.finding = conditions.BATTERY_LOW.found("soc", soc, least)
         if self._reported.lasts(t_s, is_reported) >= cfg.battery_time_s:
             self.finding = conditions.BATTERY_REPORTED.found("battery_low", soc, least)
+
+
+class ReportMonitor(Monitor):
+    """The faults that the robot reports, except those that other monitors judge."""
+
+    def __init__(self, cfg: HealthConfig) -> None:
+        super().__init__()
+        self._cfg = cfg
+        self.reset()
+
+    def reset(self) -> None:
+        """See ``Monitor``."""
+        super().reset()
+        self._reported: dict[str, FindingLatch] = {}
+
+    def step(self, t_s: float, faults: Sequence[str]) -> None:
+        """Take the faults of a frame."""
+        for name in faults:
+            if name in FANS or name == BATTERY_LOW:
+                continue
+            latch = self._reported.setdefault(name, FindingLatch(self._cfg.retry_after_s))
+            condition = REPORTED.get(name, conditions.UNKNOWN_REPORTED)
+            latch.see(t_s, condition.found(name, 1.0, 0.0, side=name.removeprefix("encoder_")))
+
+    def findings(self, t_s: float) -> list[MonitorFinding]:
+        """See ``Monitor``. A fault that has ended is dropped, because its name may be any text."""
+        found = super().findings(t_s)
+        for name, latch in list(self._reported.items()):
+            if (finding := latch.settle(t_s)) is None:
+                del self._reported[name]
+            else:
+                found.append(finding)
+        return found

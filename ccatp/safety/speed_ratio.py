@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.safety.escalation import FindingLatch
+from ccatp.safety.monitor import Monitor
 
 _SIDES = ("right", "left")
 # Error of the modelled speed, m/s, beside a wrong ratio; and of its delay, s: link, and the servo's time constant.
@@ -28,7 +28,7 @@ class _Interval(NamedTuple):
     growth: tuple[float, float]  # of the expected speed since the interval before
 
 
-class SpeedRatioMonitor:
+class SpeedRatioMonitor(Monitor):
     """Finds wheels that turn at a wrong multiple of their set points.
 
     The expected speed m is the set point u behind a first-order servo. Over a window with enough travel the measured
@@ -37,17 +37,25 @@ class SpeedRatioMonitor:
     """
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
-        self._cfg, self._radius_m, self._lag_s = cfg, robot.wheel_radius_m, robot.wheel_lag_s
-        self.alarm = FindingLatch(cfg.retry_after_s)
-        self.largest_rad_s = robot.max_wheel_rad_s  # the robot clamps to this, and keeps the ratio of the wheels
-        self.ratios: tuple[float | None, float | None] = (None, None)  # (right, left); None: too little travel
+        super().__init__()
+        self._cfg = cfg
+        self._radius_m = robot.wheel_radius_m
+        self._lag_s = robot.wheel_lag_s
+        self._max_wheel_rad_s = robot.max_wheel_rad_s
+        self.alarm = self.latch(cfg.retry_after_s)
         self._window: deque[_Interval] = deque()
         self.reset()
 
     def reset(self) -> None:
+        """See ``Monitor``."""
+        super().reset()
+        self.largest_rad_s = self._max_wheel_rad_s  # the robot clamps to this, and keeps the ratio of the wheels
+        self.restart()
+
+    def restart(self) -> None:
         """Begin a new window, because the wheels did not follow the set points known here."""
         self._window.clear()
-        self.ratios = None, None
+        self.ratios: tuple[float | None, float | None] = (None, None)  # (right, left); None: too little travel
         self._speeds: tuple[float, float] | None = None  # expected at the end of the last interval
         self._mean = _NOTHING
         self._t_s: float | None = None

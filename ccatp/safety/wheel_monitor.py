@@ -7,7 +7,8 @@ from typing import NamedTuple
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import WheelSample
-from ccatp.safety.escalation import FindingLatch, Since
+from ccatp.safety.escalation import Since
+from ccatp.safety.monitor import Monitor
 from ccatp.safety.motion_sums import MotionSum, SlidingWindow
 
 # After this time a command has less than 2 % effect on a wheel (servo 0.1 s, link 40 ms).
@@ -30,7 +31,30 @@ _FEW_SAMPLES = 5
 _STILL_M_S = 0.0005  # below this a wheel does not creep; encoder noise over ``stall_time_s`` is a tenth of it
 
 
-class Span(NamedTuple):
+class FrameSpan(NamedTuple):
+    """What is known of the frames between two judgements.
+
+    ``is_free``: in all of them the robot executed its commands, and all motion was permitted; ``is_held``: in all of
+    them it held its wheels; ``is_late``: in one of them it executed an old command; ``is_sparse``: there were fewer
+    encoder samples than usual.
+    """
+
+    is_free: bool = True
+    is_held: bool = True
+    is_late: bool = False
+    is_sparse: bool = False
+
+    def with_frame(self, *, is_permitted: bool, is_held: bool, drive_age_s: float) -> "FrameSpan":
+        """The span with one more frame. ``drive_age_s``: how long the drive has been in force."""
+        return FrameSpan(
+            self.is_free and is_permitted and not is_held,
+            self.is_held and is_held,
+            self.is_late or (drive_age_s > LATE_S and not is_held),
+            self.is_sparse,
+        )
+
+
+class SetPointSpan(NamedTuple):
     """Lowest and highest set points over several drives, m/s at the wheels' rims."""
 
     t_s: float
@@ -43,8 +67,13 @@ class Span(NamedTuple):
         """Lowest and highest of one wheel, by its index in ``_SIDES``."""
         return self[1 + 2 * side], self[2 + 2 * side]
 
+    @property
+    def is_zero(self) -> bool:
+        """Whether all set points were zero."""
+        return self[1:] == (0.0, 0.0, 0.0, 0.0)
 
-class WheelMonitor:
+
+class WheelMonitor(Monitor):
     """Finds runaway and stalled wheels, dead and frozen encoders, creeping wheels, and turns that disagree.
 
     The rules compare with the lowest and highest set points of a period, so they need no model of the servo: a wheel
@@ -52,14 +81,27 @@ class WheelMonitor:
     """
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
-        self._cfg, self._radius_m, self._base_m = cfg, robot.wheel_radius_m, robot.wheel_base_m
-        self.alarm, self.yaw = FindingLatch(cfg.retry_after_s), FindingLatch(cfg.retry_after_s)
-        self._brief, self._stalling = SlidingWindow(cfg.runaway_time_s), SlidingWindow(cfg.stall_time_s)
+        super().__init__()
+        self._cfg = cfg
+        self._radius_m = robot.wheel_radius_m
+        self._base_m = robot.wheel_base_m
+        self.alarm = self.latch(cfg.retry_after_s)
+        self.yaw = self.latch(cfg.retry_after_s)
+        self._brief = SlidingWindow(cfg.runaway_time_s)
+        self._stalling = SlidingWindow(cfg.stall_time_s)
         self._turning = SlidingWindow(cfg.yaw_time_s)
+        self.set_points: deque[SetPointSpan] = deque(maxlen=64)
+        self.reset()
+
+    def reset(self) -> None:
+        """See ``Monitor``."""
+        super().reset()
+        for window in (self._brief, self._stalling, self._turning):
+            window.reset()
+        self.set_points.clear()
         self.speed_m_s = 0.0  # of the faster wheel, over ``runaway_time_s``
-        self.spans: deque[Span] = deque(maxlen=64)
-        self._recent: Span | None = None
-        self._stall: Span | None = None
+        self._recent: SetPointSpan | None = None
+        self._stall: SetPointSpan | None = None
         self._held_s: float | None = None
         self._held_since_s: float | None = None
         self._late_s: float | None = None
@@ -71,53 +113,40 @@ class WheelMonitor:
         """Take the span (rad/s) of the drives up to ``t_s``."""
         r = self._radius_m
         a, b, c, d = commanded
-        self.spans.append(Span(t_s, r * a, r * b, r * c, r * d))
+        self.set_points.append(SetPointSpan(t_s, r * a, r * b, r * c, r * d))
 
     def learn(self, t_s: float) -> None:
         """Update the recent set points at ``t_s``, when a new span was taken or was due."""
         self._recent = self._commanded_over(t_s, _MEMORY_S)
         self._stall = self._commanded_over(t_s, self._cfg.stall_time_s + _LATENCY_S)
 
-    def _commanded_over(self, t_s: float, memory_s: float) -> Span | None:
+    def _commanded_over(self, t_s: float, memory_s: float) -> SetPointSpan | None:
         """The span of all drives of the last ``memory_s``; ``None`` unless all are known."""
-        spans, since_s = self.spans, t_s - memory_s
-        if not spans or spans[0][0] > since_s or t_s - spans[-1][0] > _LATENCY_S:
+        spans, since_s = self.set_points, t_s - memory_s
+        if not spans or spans[0].t_s > since_s or t_s - spans[-1].t_s > _LATENCY_S:
             return None
         recent = []
         for span in reversed(spans):
             recent.append(span)
-            if span[0] <= since_s:
+            if span.t_s <= since_s:
                 break
         _, right_low, right_high, left_low, left_high = zip(*recent)  # noqa: B905 - of one length
-        return Span(t_s, min(right_low), max(right_high), min(left_low), max(left_high))
+        return SetPointSpan(t_s, min(right_low), max(right_high), min(left_low), max(left_high))
 
-    def step(
-        self,
-        now: MotionSum,
-        samples: Sequence[WheelSample],
-        *,
-        is_free: bool,
-        is_held: bool,
-        is_late: bool,
-        is_sparse: bool,
-    ) -> None:
-        """Judge a frame by the running sums at its end.
-
-        Since the last call, ``is_free``: the robot executed its commands, and all motion was permitted; ``is_held``: it
-        held its wheels; ``is_late``: it executed an old command; ``is_sparse``: fewer encoder samples than usual.
-        """
-        t_s = now[0]
+    def step(self, now: MotionSum, samples: Sequence[WheelSample], frames: FrameSpan) -> None:
+        """Judge the frames since the last call by the running sums at their end; ``samples``: of the last one."""
+        t_s = now.t_s
         brief, stalling, turning = self._brief.push(now), self._stalling.push(now), self._turning.push(now)
-        self.speed_m_s = 0.0 if brief is None else max(abs(brief[1]), abs(brief[2])) / brief[0]
-        if not is_free:
+        self.speed_m_s = 0.0 if brief is None else max(abs(brief.right_m), abs(brief.left_m)) / brief.t_s
+        if not frames.is_free:
             self._held_s = t_s
-        if not is_held:
+        if not frames.is_held:
             self._held_since_s = None
         elif self._held_since_s is None:
             self._held_since_s = t_s
-        if is_late:
+        if frames.is_late:
             self._late_s = t_s
-        if is_sparse:
+        if frames.is_sparse:
             self._sparse_s = t_s
         recent = self._commanded(t_s)
         is_vague = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
@@ -133,17 +162,17 @@ class WheelMonitor:
         if turning is not None:
             self._compare_turns(t_s, turning, _VAGUE if is_vague else 1.0)
 
-    def _commanded(self, t_s: float) -> Span | None:
+    def _commanded(self, t_s: float) -> SetPointSpan | None:
         """Recent set points of the wheels; ``None`` where they are not known."""
         recent = self._recent
         if recent is not None and t_s - recent.t_s <= _LATENCY_S:
             return recent
         # The commands since then are not known. If the robot has held its wheels for long enough, none has effect.
         is_held = self._held_since_s is not None and t_s - self._held_since_s >= _MEMORY_S
-        return Span(t_s, 0.0, 0.0, 0.0, 0.0) if is_held else None
+        return SetPointSpan(t_s, 0.0, 0.0, 0.0, 0.0) if is_held else None
 
     def _find_runaway(
-        self, t_s: float, moved: MotionSum, commanded: Span, samples: Sequence[WheelSample], limit: float
+        self, t_s: float, moved: MotionSum, commanded: SetPointSpan, samples: Sequence[WheelSample], limit: float
     ) -> None:
         over_s, right_m, left_m, _ = moved
         _, right_low, right_high, left_low, left_high = commanded
@@ -185,20 +214,22 @@ class WheelMonitor:
         limit = self._cfg.stall_command_m_s
         return low >= limit or high <= -limit
 
-    def _find_creep(self, now: MotionSum, moved: MotionSum, commanded: Span, samples: Sequence[WheelSample]) -> None:
+    def _find_creep(
+        self, now: MotionSum, moved: MotionSum, commanded: SetPointSpan, samples: Sequence[WheelSample]
+    ) -> None:
         """Find motion at a set point of zero, except while a robot behind a stalled link executes its last command."""
         runs_down_s = _MEMORY_S + self._cfg.stall_time_s
-        is_running_down = self._late_s is not None and now[0] - self._late_s < runs_down_s
-        if is_running_down or commanded[1:] != (0.0, 0.0, 0.0, 0.0):
+        is_running_down = self._late_s is not None and now.t_s - self._late_s < runs_down_s
+        if is_running_down or not commanded.is_zero:
             self._stood = None
             return
         if self._stood is None:
             self._stood = now
             self._creeping = Since(), Since()
             return
-        cfg, stood, t_s = self._cfg, self._stood, now[0]
+        cfg, stood, t_s = self._cfg, self._stood, now.t_s
         for k, side in enumerate(_SIDES):
-            speed_m_s, crept_m = abs(moved[1 + k]) / moved[0], abs(now[1 + k] - stood[1 + k])
+            speed_m_s, crept_m = abs(moved.of(k)) / moved.t_s, abs(now.of(k) - stood.of(k))
             creeps = crept_m > cfg.creep_m and speed_m_s > _STILL_M_S
             is_moving = creeps or speed_m_s > cfg.stop_speed_m_s
             broken = _what_is_broken(samples, k) if is_moving else ""

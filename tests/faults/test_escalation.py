@@ -217,4 +217,4 @@ def test_the_commanded_speed_of_the_wheels_counts_however_old_the_estimate(
     for _ in range(3):
         monitor.step(frame, estimate)
         frame = msgspec.structs.replace(frame, seq=frame.seq + 1)
-    assert [span.right_high / cfg.robot.wheel_radius_m for span in wheels.spans] == expected
+    assert [span.right_high / cfg.robot.wheel_radius_m for span in wheels.set_points] == expected

@@ -3,10 +3,11 @@
 import pytest
 
 from ccatp.config.load import load_config
-from ccatp.core import EmergencyKind
+from ccatp.core import DeckPose, EmergencyKind
 from ccatp.safety.edge_monitors import SeamMonitor
 from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, EmergencyLatch
-from ccatp.safety.wheel_monitor import WheelMonitor
+from ccatp.safety.motion_sums import MotionSum
+from ccatp.safety.wheel_monitor import FrameSpan, WheelMonitor
 from ccatp.survey.events import MissionState
 from tests.support.scenario import mirror_of
 
@@ -42,8 +43,8 @@ def test_a_wheel_that_rolls_though_it_shall_stand_is_found(
             monitor.take_commands(t_s, (0.0, 0.0, 0.0, 0.0))
             monitor.learn(t_s)
         rolled_m += ROLLS_M_S * FRAME_S * (t_s > rolls_from_s)
-        flags = {"is_free": not is_silent, "is_held": is_held and is_silent, "is_late": t_s <= late_until_s}
-        monitor.step((t_s, rolled_m, 0.0, 0.0), (), **flags, is_sparse=False)
+        frames = FrameSpan(is_free=not is_silent, is_held=is_held and is_silent, is_late=t_s <= late_until_s)
+        monitor.step(MotionSum(t_s, rolled_m, 0.0, 0.0), (), frames)
     assert (monitor.alarm.finding is None) is (expected_s is None)
     assert expected_s is None or expected_s[0] < t_s < expected_s[1]
 
@@ -59,10 +60,10 @@ def test_each_seam_that_a_sensor_has_crossed_is_counted(step_m: float) -> None:
     way = [k * length_m / steps for k in range(steps + 1)]
     for k, x_m in enumerate(way + way[::-1]):
         sigma_m = 0.05 if k % 100 < 10 else 1e-3  # so uncertain now and then that no sensor is on a panel for certain
-        monitor.step(0.05 * k, (panel.x_m + x_m, panel.y_m, 0.0), sigma_m)
+        monitor.step(0.05 * k, DeckPose(panel.x_m + x_m, panel.y_m, 0.0), sigma_m)
     assert monitor.missed == [4] * 4  # seams, by sensors that are never off
     for turned in range(60):
-        monitor.step(0.05 * (2 * steps + turned), (panel.x_m, panel.y_m, 0.05 * turned), 1e-3)
+        monitor.step(0.05 * (2 * steps + turned), DeckPose(panel.x_m, panel.y_m, 0.05 * turned), 1e-3)
     assert monitor.missed == [4] * 4
 
 
