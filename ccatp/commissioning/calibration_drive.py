@@ -19,8 +19,8 @@ from ccatp.records.run_reader import Marked, in_order, open_run
 
 # The robot is at rest in a frame if no wheel turns by more than both of these: an angle, and a multiple of the standard
 # deviation of the frame's summed encoder noise.
-REST_RAD = 2e-6
-REST_SIGMAS = 6.0
+LEAST_TURN_RAD = 2e-6
+LEAST_TURN_SIGMAS = 6.0
 # Encoder noise is estimated from frames in which the wheel turns by less than this.
 SLOW_RAD = 3e-5
 # Rests shorter than this do not separate motions.
@@ -168,9 +168,9 @@ class DriveBuilder:
 
     def _rest_rad(self) -> float:
         if not self._scatters or self._wheels[0].is_counter:  # a counter at rest has no noise
-            return REST_RAD
+            return LEAST_TURN_RAD
         noise_rad = median(self._scatters) * median(self._periods) * sqrt(self._samples)
-        return max(REST_RAD, REST_SIGMAS * noise_rad)
+        return max(LEAST_TURN_RAD, LEAST_TURN_SIGMAS * noise_rad)
 
     def _place(self, fix: Fix) -> FixedPlace:
         x, y, _ = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)

@@ -18,6 +18,7 @@ from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.report.html import render
+from ccatp.rest import WHEEL_STANDS_RAD_S
 from ccatp.survey.checks import MirrorCheck
 from ccatp.survey.composition import robot_problems
 
@@ -130,7 +131,6 @@ def _listed(channels: Iterable[int]) -> str:
 
 EDGES = ("front left", "front right", "rear left", "rear right")
 CLOCK_TOLERANCE = 0.01
-STANDING_RAD_S = 0.02
 BIAS_SIGMAS = 5.0
 
 
@@ -206,7 +206,7 @@ def _encoders(report: RobotReport) -> PreflightResult:
         rates = [rate for frame in report.frames for row in frame.enc if (rate := row[index]) is not None]
         if slow := _rate("enc", len(rates), report):
             return slow._replace(found=f"{side}: {slow.found}")
-        if abs(fmean(rates)) > STANDING_RAD_S:
+        if abs(fmean(rates)) > WHEEL_STANDS_RAD_S:
             return failed(f"{side} wheel turns at {fmean(rates):.3f} rad/s, and should stand", todo)
     return passed("both wheels stand")
 

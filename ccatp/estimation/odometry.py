@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from ccatp.core import ImuSample, Vector3
 from ccatp.mirror.mirror import Mirror
+from ccatp.rest import NO_MOTION_M, NO_MOTION_RAD
 
 # Third derivatives of these mirrors stay below 3e-3 1/m^2, so within this distance a slope is off by less than 1e-7.
 _REACH_M = 5e-3
@@ -85,8 +86,6 @@ def gravity_on(slope: Slope, psi: float, gravity: Vector3) -> Vector3:
     return hx * gx + hy * gy + (fx * hx + fy * hy) * gz, lx * gx + ly * gy + (fx * lx + fy * ly) * gz, along
 
 
-_STILL_M = 2e-5
-_STILL_RAD = 1e-4
 _SMALL_RAD = 1e-4
 
 
@@ -134,7 +133,7 @@ class Odometer:
         if len(path) > 1:
             before, now = path[-2][1], self.place
             way_m, turned_rad = hypot(now.x_m - before.x_m, now.y_m - before.y_m), now.heading_rad - before.heading_rad
-            if way_m < _STILL_M and abs(turned_rad) < _STILL_RAD:
+            if way_m < NO_MOTION_M and abs(turned_rad) < NO_MOTION_RAD:
                 path.pop()
         path.append((t_s, self.place))
         oldest = t_s - self._history_s

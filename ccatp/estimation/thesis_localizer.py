@@ -25,6 +25,7 @@ from ccatp.estimation.wheel_coast import WheelInput
 from ccatp.filters.base import FilterDiverged, Innovation
 from ccatp.kinematics import difference, rotate, wheel_rates, wrap_pi
 from ccatp.mirror.mirror import Mirror
+from ccatp.rest import WHEEL_STANDS_RAD_S
 
 V, A, THETA, OMEGA = range(4)
 """Order of the state q of thesis eq. 2.1: speed m/s, acceleration m/s^2, heading rad, rate rad/s.
@@ -117,7 +118,6 @@ class ConstantAcceleration:
 
 
 _LOST = 1.5  # number of pauses between two frames with samples beyond which samples are missing
-_STILL_RAD_S = 0.02  # a slower wheel stands
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
 _SELECT_HEADING = np.eye(STATES)[THETA : THETA + 1]
 
@@ -266,7 +266,7 @@ class FourStateLocalizer(LocalizerBase):
         coast = self._coast
         if not coast.gap_s:
             rates = self._wheel_rates()
-            is_resting = max(map(abs, rates)) < _STILL_RAD_S
+            is_resting = max(map(abs, rates)) < WHEEL_STANDS_RAD_S
             coast.begin(*rates, (self._cfg.encoder_sigma_rad_s * self._pause_s) ** 2, is_resting=is_resting)
         self.coasted = now = coast.advance(dt_s, set_points)
         self.gap_s += dt_s

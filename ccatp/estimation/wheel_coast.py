@@ -23,10 +23,10 @@ from math import copysign, exp, sqrt
 from typing import NamedTuple
 
 from ccatp.control.wheel_motion import SetPoints
+from ccatp.rest import NO_MOTION_RAD
 
 # A drive acts in the next step of the control loop, which has 500 Hz or more: uniform over 2 ms.
 _DEAD_TIME_S = 0.0006
-_STILL_RAD = 1e-4  # a wheel that turns less in a frame stands: 3 um
 # Standard deviation of a lag that was never measured: the worlds draw it uniformly from 20 % to both sides.
 _LAG_SPREAD = 0.2 / sqrt(3.0)
 # A lag is never known better than to this part: servo and load are not exactly of first order.
@@ -191,7 +191,7 @@ class WheelCoast:
             found = self._advance(dt_s, set_points)
         right_rad, left_rad, right_rad2, left_rad2, both_rad2 = found
         self.rates = right_rad / dt_s, left_rad / dt_s
-        self.has_moved = self.has_moved or abs(right_rad) + abs(left_rad) > _STILL_RAD
+        self.has_moved = self.has_moved or abs(right_rad) + abs(left_rad) > NO_MOTION_RAD
         if not (is_right and is_left):
             right_rad2, left_rad2, both_rad2 = is_right * right_rad2, is_left * left_rad2, 0.0
         return CoastedMotion(right_rad, left_rad, right_rad2, left_rad2, both_rad2)

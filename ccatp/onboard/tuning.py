@@ -19,7 +19,7 @@ from ccatp.onboard.wheel_servo import WheelServo
 POLES = 4.0  # rate of decay of the speed error / rate at which the servo follows the set point
 _LEVELS = 8
 _HOLD_S, _SETTLED_S = 0.6, 0.3
-_MOVING_RAD_S = 0.2
+_LEAST_RATE_RAD_S = 0.2  # of a measurement: a slower wheel may stick
 _TOP_SHARE = 0.8  # of the largest voltage
 _STEP_S = 0.8
 _STEP_SHARE = 0.5  # of the speed at the top voltage
@@ -127,7 +127,7 @@ def tune(
 
 
 def _fit(speeds: Sequence[Sequence[float]], rises: Sequence[Sequence[float]], k: int, name: str) -> WheelTuning:
-    moving = [(abs(row[0]), row[k] * copysign(1.0, row[0])) for row in speeds if abs(row[k]) > _MOVING_RAD_S]
+    moving = [(abs(row[0]), row[k] * copysign(1.0, row[0])) for row in speeds if abs(row[k]) > _LEAST_RATE_RAD_S]
     if len(moving) < _LEVELS:
         raise HardwareError(
             f"the {name} wheel hardly turns: look at the motor's supply, its two lines, and the encoder; "

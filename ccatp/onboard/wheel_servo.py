@@ -13,8 +13,7 @@ from collections import deque
 from math import copysign, exp, pi
 
 from ccatp.config.onboard_models import WheelServoConfig
-
-_REST_RAD_S = 0.02  # below this speed a wheel, or its reference with a set point of zero, is at rest
+from ccatp.rest import WHEEL_STANDS_RAD_S
 
 
 class WheelServo:
@@ -57,7 +56,7 @@ class WheelServo:
         decay = exp(-dt_s / cfg.response_s)
         before = self._reference_rad_s
         self._reference_rad_s = reference = set_point_rad_s + (before - set_point_rad_s) * decay
-        if set_point_rad_s == 0.0 and abs(reference) < _REST_RAD_S:
+        if set_point_rad_s == 0.0 and abs(reference) < WHEEL_STANDS_RAD_S:
             self._reference_rad_s = reference = 0.0
         way_rad = set_point_rad_s * dt_s + (before - set_point_rad_s) * cfg.response_s * (1.0 - decay)
         ahead_rad = self._ahead_rad + way_rad
@@ -71,7 +70,7 @@ class WheelServo:
         if voltage_v == wanted_v or way_rad * (wanted_v - voltage_v) < 0.0:
             self._ahead_rad = ahead_rad
         self.voltage_v = voltage_v
-        is_pushing = abs(voltage_v) >= cfg.max_v and abs(self.rate_rad_s) < _REST_RAD_S
+        is_pushing = abs(voltage_v) >= cfg.max_v and abs(self.rate_rad_s) < WHEEL_STANDS_RAD_S
         self._stalled_s = self._stalled_s + dt_s if is_pushing else 0.0
         return voltage_v
 

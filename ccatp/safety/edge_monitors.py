@@ -9,14 +9,11 @@ from ccatp.conditions import MonitorFinding
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import Corner, DeckPose, EdgeSample, PanelId
 from ccatp.mirror.mirror import Mirror
+from ccatp.rest import ALMOST_AT_REST_M_S
 from ccatp.safety.escalation import FindingLatch
 from ccatp.safety.monitor import Monitor
 
 _CORNERS = tuple(corner.value for corner in Corner)
-
-
-# Below this speed no sensor crosses an edge.
-_STILL_M_S = 0.002
 
 
 _CLEAR_S = 0.2
@@ -59,7 +56,7 @@ class FlickerMonitor(Monitor):
         for sample in samples:
             state = sample[1:]
             if state != self._last:
-                self._change(sample[0], state, is_still=speed_m_s < _STILL_M_S)
+                self._change(sample[0], state, is_still=speed_m_s < ALMOST_AT_REST_M_S)
         for i, changes in enumerate(self._changes):
             while changes and changes[0] < since_s:
                 changes.popleft()

@@ -28,14 +28,14 @@ from ccatp.config.models import DangerConfig, RobotConfig
 from ccatp.core import EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim
+from ccatp.rest import AT_REST_M_S, WHEEL_STANDS_RAD_S
 from ccatp.safety.edge_episode import EdgeEpisode, EdgeLimits
 from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.wheel_odometry import Odometry, WheelTrack, pose_at
 from ccatp.sensing.wheel_means import largest_rate_rad_s
 
 SENSORS = 4
-# Below this speed the robot stands. At rest only a fix can reduce the estimate's sigma to less than half.
-_STILL_M_S = 5e-4
+# At rest only a fix can reduce the estimate's sigma to less than half.
 _BY_A_FIX = 0.5
 # Heading error that a fix may leave: a fix corrects the position at once, but not the heading.
 _HEADING_RAD = 0.1
@@ -133,7 +133,7 @@ class EdgeRule:
                 self._place(episode, self._offsets[i], odometry, estimate)
 
     def _has_fix(self, odometry: Odometry, sigma_m: float) -> bool:
-        is_still = abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * self._half_base_m < _STILL_M_S
+        is_still = abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * self._half_base_m < AT_REST_M_S
         has_fix = is_still and sigma_m < _BY_A_FIX * self._largest_sigma_m
         self._largest_sigma_m = max(self._largest_sigma_m, sigma_m) if is_still and not has_fix else sigma_m
         return has_fix
@@ -203,8 +203,6 @@ def _fastest(robot: RobotConfig, offset_m: tuple[float, float]) -> float:
 
 # Longest time between two look-ups of a large clearance: a fix may move the estimate.
 LOOK_PERIOD_S = 0.1
-# Sum of the wheel rates above which the robot moves: encoder noise is below it (0.3 mm/s).
-MOVING_RAD_S = 0.02
 
 
 class CentreClearanceCheck:
@@ -242,7 +240,7 @@ class CentreClearanceCheck:
         if right is None or left is None:
             return
         total = right + left
-        if abs(total) < MOVING_RAD_S:
+        if abs(total) < WHEEL_STANDS_RAD_S:  # not even one wheel shows motion
             return
         direction = 1 if total > 0.0 else -1
         ahead_m = direction * self._margin_m

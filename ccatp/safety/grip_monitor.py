@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import GravitySample, ImuSample
+from ccatp.rest import LOADED_WHEEL_STANDS_RAD_S
 from ccatp.safety.monitor import Monitor
 from ccatp.sensing.wheel_means import WheelMeans
 from ccatp.slide_rule import SlideRule
 
 _GRAVITY_TIME_S = 0.2  # time constant of the average of the noisy gravity samples
-_STILL_RAD_S = 0.05  # on a slope a held wheel turns more slowly than this
 _HOLDS = 1.05  # full thrust over the least; below this the robot may slide anywhere
 _REPORTED_CONTACTS = 20.0  # a slide of 1.2 s has up to 19
 
@@ -76,7 +76,8 @@ class GripMonitor(Monitor):
         self._speed_m_s = speed_m_s
         change_m_s = speed_m_s - before_m_s
         is_sound = rule.is_possible(ax) and abs(change_m_s) < rule.WHEEL_JUMP_M_S
-        is_still = -_STILL_RAD_S < right < _STILL_RAD_S and -_STILL_RAD_S < left < _STILL_RAD_S
+        stands_rad_s = LOADED_WHEEL_STANDS_RAD_S
+        is_still = -stands_rad_s < right < stands_rad_s and -stands_rad_s < left < stands_rad_s
         if is_still and self._rested < rule.BIAS_SAMPLES and is_sound:
             self._rested += 1
             self._bias_m_s2 += (ax - self._bias_m_s2) / self._rested

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from ccatp import conditions
 from ccatp.config.models import HealthConfig
 from ccatp.core import ImuSample
+from ccatp.rest import WHEEL_STANDS_RAD_S
 from ccatp.safety.monitor import Monitor
 from ccatp.sensing.imu_gate import ImuGate
 from ccatp.sensing.wheel_means import WheelMeans
 
-_STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s
 # The gyroscope's bias, averaged at rest. Readings are bounded, so that garbage cannot move it far.
 _BIAS_TIME_S = 0.5
 _LARGEST_BIAS_RAD_S = 0.35
@@ -43,7 +43,7 @@ class ImuMonitor(Monitor):
         if not usable:
             return means.yaw_rad_s * dt_s
         wz = usable[-1][2]
-        if -_STANDS_RAD_S < right < _STANDS_RAD_S and -_STANDS_RAD_S < left < _STANDS_RAD_S:
+        if -WHEEL_STANDS_RAD_S < right < WHEEL_STANDS_RAD_S and -WHEEL_STANDS_RAD_S < left < WHEEL_STANDS_RAD_S:
             bounded = min(max(wz, -_LARGEST_BIAS_RAD_S), _LARGEST_BIAS_RAD_S)
             self.bias_rad_s += dt_s / (_BIAS_TIME_S + dt_s) * (bounded - self.bias_rad_s)
             return 0.0

@@ -14,7 +14,7 @@ _SPEED_SIGMA_M_S, _DELAY_SIGMA_S = 0.008, 0.05
 _LEAST_COVER = 0.3  # least part of an interval with encoder samples
 _LONGEST_S = 0.12  # a longer interval between two set points has an unknown one in between
 _FULL = 0.9  # part of the window that must be known
-_STANDS = 0.25  # a slower wheel, relative to what is expected, is about to stand
+_LEAST_SHARE = 0.25  # a slower wheel, relative to what is expected, is about to stand
 _NOTHING = (0.0, 0.0)
 
 
@@ -109,7 +109,7 @@ class SpeedRatioMonitor(Monitor):
         A wheel that stands is found, with its reason, by ``WheelMonitor``.
         """
         newest = self._window[-1]
-        if abs(newest.measured[side]) < _STANDS * abs(newest.expected[side]):
+        if abs(newest.measured[side]) < _LEAST_SHARE * abs(newest.expected[side]):
             return None
         travel_m = mm = md = dd = my = dy = 0.0
         for _, length_s, measured, expected, growth in self._window:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import WheelSample
+from ccatp.rest import AT_REST_M_S
 from ccatp.safety.escalation import Since
 from ccatp.safety.monitor import Monitor
 from ccatp.safety.motion_sums import MotionSum, SlidingWindow
@@ -28,7 +29,6 @@ _SIDES = ("right", "left")
 # No wheel changes its rate by more within a frame; two counts in a sample of 1 ms are 10 rad/s.
 _WILD_RAD_S = 12.0
 _FEW_SAMPLES = 5
-_STILL_M_S = 0.0005  # below this a wheel does not creep; encoder noise over ``stall_time_s`` is a tenth of it
 
 
 class FrameSpan(NamedTuple):
@@ -230,7 +230,7 @@ class WheelMonitor(Monitor):
         cfg, stood, t_s = self._cfg, self._stood, now.t_s
         for k, side in enumerate(_SIDES):
             speed_m_s, crept_m = abs(moved.of(k)) / moved.t_s, abs(now.of(k) - stood.of(k))
-            creeps = crept_m > cfg.creep_m and speed_m_s > _STILL_M_S
+            creeps = crept_m > cfg.creep_m and speed_m_s > AT_REST_M_S
             is_moving = creeps or speed_m_s > cfg.stop_speed_m_s
             broken = _what_is_broken(samples, k) if is_moving else ""
             lasts_s = self._creeping[k].lasts(t_s, creeps and not broken)

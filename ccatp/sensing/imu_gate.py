@@ -5,8 +5,7 @@ from math import inf
 
 from ccatp.config.models import HealthConfig
 from ccatp.core import ImuSample
-
-_STILL_RAD_S = 0.02  # yaw rate of wheels that stand
+from ccatp.rest import ROBOT_TURNS_RAD_S
 
 
 class ImuGate:
@@ -59,7 +58,7 @@ class ImuGate:
         return samples if is_good else ()
 
     def _compare(self, ax: float, wz: float, yaw_rad_s: float) -> None:
-        if -_STILL_RAD_S < yaw_rad_s < _STILL_RAD_S and ax != self._ax and wz != self._wz:
+        if -ROBOT_TURNS_RAD_S < yaw_rad_s < ROBOT_TURNS_RAD_S and ax != self._ax and wz != self._wz:
             self._different += 1
             self._is_noisy = self._is_noisy or self._different >= self._identical
         else:

@@ -19,6 +19,7 @@ from ccatp.estimation.state_model import CT
 from ccatp.links.robot_messages import Hello
 from ccatp.localizer import Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.rest import ALMOST_AT_REST_M_S, ALMOST_AT_REST_RAD_S
 from ccatp.survey.events import HELD, IDLE, MEASURING, SETTLING, MissionState, TakenOver
 from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner
 from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
@@ -30,8 +31,7 @@ from ccatp.survey.statechart import Mission, Survey
 RADIUS_TOLERANCE = 0.05
 SENSOR_TOLERANCE_M = 0.005
 
-# Speeds below which a robot in a standing mode is at rest.
-_STILL_M_S, _STILL_RAD_S = 0.002, 0.01
+# Modes in which the robot is told to stand.
 _STANDING = (IDLE, SETTLING, MEASURING, HELD, MissionState.DONE)
 # Standard deviations for a robot that stood: it may have crept, or somebody may have touched it.
 _STOOD_M, _STOOD_RAD = 0.005, 0.01
@@ -91,7 +91,7 @@ class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=3, forbid_unk
         """Standard deviations of position (m) and heading (rad) after a time without observation."""
         v, omega = abs(self.speed_m_s), abs(self.rate_rad_s)
         way_m = turn_rad = 0.0
-        if self.state.mode not in _STANDING or v >= _STILL_M_S or omega >= _STILL_RAD_S:
+        if self.state.mode not in _STANDING or v >= ALMOST_AT_REST_M_S or omega >= ALMOST_AT_REST_RAD_S:
             way_m = _UNSEEN_S * (v + _BEGUN_S * limits.a_max_m_s2)
             turn_rad = _UNSEEN_S * (omega + _BEGUN_S * limits.alpha_max_rad_s2)
         return hypot(self.sigma_m, way_m, _STOOD_M), hypot(self.heading_sigma_rad, turn_rad, _STOOD_RAD)
