@@ -48,12 +48,15 @@ class DangerMonitor(SafetyRules):
     def __init__(
         self, mirror: Mirror, robot: RobotConfig, cfg: DangerConfig, health: HealthConfig | None = None
     ) -> None:
-        self._rim, self._robot, self._cfg, self._health = mirror.rim, robot, cfg, health
+        self._rim = mirror.rim
+        self._robot = robot
+        self._cfg = cfg
+        self._clock_jump_s = CLOCK_JUMP_S if health is None else health.clock_jump_s
         self._map = EdgeMap(mirror)
         self._edges = EdgeRule(self._map, robot, cfg)
-        self._health_monitor: HealthMonitor | None = None
+        self._health: HealthMonitor | None = None
         if health is not None:
-            self._health_monitor = HealthMonitor(health, cfg, robot, mirror, self._is_explained)
+            self._health = HealthMonitor(health, cfg, robot, mirror, self._is_explained)
         super().__init__()
 
     def reset(self) -> None:
@@ -61,20 +64,20 @@ class DangerMonitor(SafetyRules):
         super().reset()
         self._edges.reset()
         self._centre_clearance = CentreClearanceCheck(self._rim, self._robot, self._cfg)
-        self._time = SteadyTime(CLOCK_JUMP_S if self._health is None else self._health.clock_jump_s)
+        self._time = SteadyTime(self._clock_jump_s)
         self._edge_t_s: float | None = None
         self._frame_seq = self._state_seq = -1
         self._state = ""
         self._known: EstimateMessage | None = None
-        if self._health_monitor is not None and self._health is not None:
-            self._health_monitor.reset()
-            self._escalation = SeverityEscalation(self._health)
+        if self._health is not None:
+            self._health.reset()
+            self._escalation = SeverityEscalation(self._health.cfg)
         self.verdict = self.stale(-1, 0.0)
 
     def limit_wheels(self, max_wheel_rad_s: float) -> None:
         """Take the robot's own limit for the wheels' rates, after a reset."""
-        if self._health_monitor is not None:
-            self._health_monitor.limit_wheels(min(max_wheel_rad_s, self._robot.max_wheel_rad_s))
+        if self._health is not None:
+            self._health.limit_wheels(min(max_wheel_rad_s, self._robot.max_wheel_rad_s))
 
     @property
     def code(self) -> EventCode:
@@ -100,7 +103,7 @@ class DangerMonitor(SafetyRules):
         seq = sensors.seq
         if seq <= self._frame_seq:
             return self.stale(seq, sensors.t)
-        edges, clearance, time, health = self._edges, self._centre_clearance, self._time, self._health_monitor
+        edges, clearance, time, health = self._edges, self._centre_clearance, self._time, self._health
         t_s = time.at(seq, sensors.t)
         sensors = self._with_possible_times(sensors, t_s)
         wheels: Sequence[WheelSample] = sensors.enc
@@ -135,7 +138,9 @@ class DangerMonitor(SafetyRules):
         else:
             verdict = self._arbitrate(seq, sensors.t, missing)
             if health is not None:
-                self.found = self._escalation.escalate(t_s, [*found, *self._rule_findings(missing)])
+                self._suspect_sensors(health.cfg.stuck_off_m)
+                findings = [*found, *missing, *self._edge_findings(health.cfg.stuck_off_m)]
+                self.found = self._escalation.escalate(t_s, findings)
                 verdict = with_findings(verdict, self.found)
             self.verdict = verdict = self.latch.with_emergencies(verdict)
         return verdict
@@ -146,8 +151,8 @@ class DangerMonitor(SafetyRules):
         edge = possible_samples(frame.t, frame.edge)
         if imu is frame.imu and enc is frame.enc and edge is frame.edge:
             return frame
-        if self._health_monitor is not None:
-            self._health_monitor.misdated(t_s, frame)
+        if self._health is not None:
+            self._health.misdated(t_s, frame)
         return msgspec.structs.replace(frame, imu=imu, enc=enc, edge=edge)
 
     # -- monitors -------------------------------------------------------------------------------------------------
@@ -181,21 +186,18 @@ class DangerMonitor(SafetyRules):
         slack_m = cfg.gap_tolerance_m + cfg.seam_extra_m + cfg.map_sigmas * known.sigma_m
         return self._map.has_edge_near(self._place(known, sensor), slack_m)
 
-    def _rule_findings(self, missing: Sequence[MonitorFinding]) -> list[MonitorFinding]:
-        found = [*missing]
-        if self._health is None:
-            return found
+    def _edge_findings(self, limit_m: float) -> list[MonitorFinding]:
+        """Findings beside a declared edge. ``limit_m``: see ``_suspect_sensors``."""
+        found = []
         if self._edges.is_lifted:
             found.append(conditions.LIFTED.found("edge", 4.0, 3.0))
-        limit_m = self._health.stuck_off_m
-        self._suspect_sensors(limit_m)
         for i, episode in enumerate(self._edges.episodes):
             if episode is not None and episode.is_suspect:
                 found.append(conditions.EDGE_SENSOR_STAYS_OFF.found(CORNERS[i].value, episode.retreat_m, limit_m))
         return found
 
     def _suspect_sensors(self, limit_m: float) -> None:
-        """Doubt each sensor that stays off although the robot has left the edge, until its episode ends."""
+        """Suspect each sensor that stays off ``limit_m`` from the place of its edge, until its episode ends."""
         for i, episode in enumerate(self._edges.episodes):
             if episode is None or episode.edge is None or episode.retreat_m < limit_m:
                 continue
@@ -214,7 +216,7 @@ class DangerMonitor(SafetyRules):
 
     def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
         """Count a line after frame ``seq`` that is not a frame. Too many give a verdict that permits no motion."""
-        found = None if self._health_monitor is None else self._health_monitor.garbled(at_s)
+        found = None if self._health is None else self._health.garbled(at_s)
         return None if found is None else self._denied(seq, t_s, found)
 
     def _denied(self, seq: int, t_s: float, finding: MonitorFinding) -> Verdict:

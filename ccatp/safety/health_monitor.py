@@ -41,7 +41,7 @@ class HealthMonitor:
         mirror: Mirror,
         is_explained: Callable[[int], bool],
     ) -> None:
-        self._cfg = cfg
+        self.cfg = cfg
         self._wheel_radius_m = robot.wheel_radius_m
         self._mirror = mirror
         self._means = WheelMeans(robot)
@@ -129,7 +129,7 @@ class HealthMonitor:
         self._frames += 1
         is_sliding = self._grip.step(t_s, dt_s, imu, self._means, frame.gravity, self._imu.bias_rad_s)
         if frame.sliding:
-            is_sliding = self._grip.report(t_s, self._cfg.grip_slip_m_s)
+            is_sliding = self._grip.report(t_s, self.cfg.grip_slip_m_s)
         is_due = self._frames % _LOOK_FRAMES == 0 or is_flickering or is_gap or is_sliding
         if is_due or frame.faults or self.findings or self._imu.is_left_out:
             self._judge(t_s, frame, wheels)

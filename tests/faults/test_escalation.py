@@ -204,7 +204,7 @@ def test_the_commanded_speed_of_the_wheels_counts_however_old_the_estimate(
     cfg = load_config()
     monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
     robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(1))
-    wheels = monitor._health_monitor._wheels  # type: ignore[union-attr]
+    wheels = monitor._health._wheels  # type: ignore[union-attr]
     wheels.take_commands(0.5, (0.0, 0.0, 0.0, 0.0))
     while (frame := robot.delivered) is None or frame.seq < 100:
         robot.advance()
