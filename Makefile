@@ -83,25 +83,25 @@ new-examples: $(VENV)/.installed-dev
 	$(PYTEST) tests/property tests/oracle --hypothesis-profile=explore
 
 sweep: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.faults.edge_sweep build/sweep --workers $(WORKERS) --share $(SHARE) $(ARGS)
+	$(BIN)/python -m tools.edge_sweep build/sweep --workers $(WORKERS) --share $(SHARE) $(ARGS)
 
 kills: $(VENV)/.installed-dev
 	@mkdir -p build
-	$(BIN)/python -m tests.processes.kill_campaign build/kills.jsonl --workers $(WORKERS) --signals $(SIGNALS) $(ARGS)
+	$(BIN)/python -m tools.kill_campaign build/kills.jsonl --workers $(WORKERS) --signals $(SIGNALS) $(ARGS)
 
 mutants: $(VENV)/.installed-dev
-	nice -n 19 $(BIN)/python -m tests.mutation $(TARGETS)
+	nice -n 19 $(BIN)/python -m tools.mutation $(TARGETS)
 
 faults: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.faults.table
 
 docs: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.docs.generated
+	$(BIN)/python -m tools.generated_docs
 	$(BIN)/python -m sphinx -W -q -b html docs build/docs
 	@echo "ccatp: build/docs/index.html"
 
 man: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.docs.generated
+	$(BIN)/python -m tools.generated_docs
 	$(BIN)/python -m sphinx -W -q -b man docs build/man
 	@echo "ccatp: build/man/ccatp.1"
 
@@ -111,10 +111,10 @@ GOLDEN_CACHE ?= build/golden
 GOLDEN = --data $(RADIO_DATA) --cache $(GOLDEN_CACHE)
 
 golden: $(VENV)/.installed-dev
-	@$(BIN)/python -m tests.golden $(GOLDEN) $(ARGS)
+	@$(BIN)/python -m tools.golden $(GOLDEN) $(ARGS)
 
 golden-quick: $(VENV)/.installed-dev
-	@$(BIN)/python -m tests.golden $(GOLDEN) --quick --reuse-base $(ARGS)
+	@$(BIN)/python -m tools.golden $(GOLDEN) --quick --reuse-base $(ARGS)
 
 onboard-wheel: $(VENV)/.installed-dev
 	@mkdir -p build
@@ -122,7 +122,7 @@ onboard-wheel: $(VENV)/.installed-dev
 	@echo "ccatp: $$(ls -t build/ccatp_onboard-*.whl | head -n 1)"
 
 metrics: $(VENV)/.installed-dev
-	@$(BIN)/python -m tests.metrics $(ARGS)
+	@$(BIN)/python -m tools.metrics $(ARGS)
 
 environment: $(VENV)/.installed-dev
 
@@ -170,4 +170,4 @@ lock:
 
 clean:
 	rm -rf $(VENV) $(NEWEST_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
-	find ccatp tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find ccatp tests tools -name __pycache__ -type d -prune -exec rm -rf {} +

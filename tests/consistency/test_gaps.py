@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.consistency.gap_campaign import Cell, cells_of, table
-from tests.consistency.gap_rig import FILTERS, MOTORS, SILENT, WAYS, WORLDS, Drive, Way, run
 from tests.faults.linking import Measured
+from tools.gap_campaign import Cell, cells_of, table
+from tools.gap_rig import FILTERS, MOTORS, SILENT, WAYS, WORLDS, Drive, Way, run
 
 ROW = pytest.mark.fault("S32")
 

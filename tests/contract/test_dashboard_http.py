@@ -24,7 +24,7 @@ from ccatp.daemon.supervision.process import open_log
 from ccatp.links.channels import format_error, format_ok
 from ccatp.report.dashboard.app import build_app
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
-from tests.unit.dashboard.test_view import parse
+from tests.unit.report.dashboard.test_view import parse
 
 FILES = (
     "page.js", "map.js", "plots.js", "commands.js", "alarms.js", "history.js",

@@ -17,9 +17,9 @@ from _pytest.mark.structures import ParameterSet
 from ccatp.cli import cli, main
 from ccatp.conditions import Owner, all_conditions
 from ccatp.filters import FILTERS
-from tests.docs.generated import DOCS, MADE, MARKED, ROOT, pages, shown
+from tests.support.recorded import record
 from tests.support.rows import OTHERS
-from tests.unit.reporting.recorded import record
+from tools.generated_docs import DOCS, MADE, MARKED, ROOT, pages, shown
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 SOURCES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md"]
@@ -27,7 +27,7 @@ LONGEST_RESULT = 5  # lines, of a page of measurements
 # Console commands that are quick and need no daemon: these are not only understood but run.
 EXAMPLES = {"ID": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"}  # for placeholders that a command would refuse
 RUN = frozenset(("config", "plan", "report", "align", "compare"))
-DRAW_FOR_SECONDS = frozenset(("report", "compare"))  # what they do is tried in tests/unit/reporting
+DRAW_FOR_SECONDS = frozenset(("report", "compare"))  # what they do is tried in tests/unit/report
 
 
 def blocks(path: Path, *languages: str) -> list[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.generated import DOCS, ROOT
+from tools.generated_docs import DOCS, ROOT
 
 BESIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "packaging/onboard/README.md")
 PAGES = [*sorted(DOCS.rglob("*.md")), *(ROOT / name for name in BESIDE)]
@@ -89,7 +89,7 @@ def test_files_and_folders_in_backticks_exist() -> None:
 
 def test_pages_that_other_files_name_exist() -> None:
     kinds = (".py", ".toml", ".js", ".css", ".html", ".md", ".service", ".yml", ".yaml", ".json")
-    folders = [ROOT / name for name in ("ccatp", "configs", "docs", "packaging", "tests")]
+    folders = [ROOT / name for name in ("ccatp", "configs", "docs", "packaging", "tests", "tools")]
     files = [path for folder in folders for path in folder.rglob("*") if path.suffix in kinds]
     missing = [
         f"{path.relative_to(ROOT)}: {name}"

@@ -21,7 +21,7 @@ from tests.faults.linking import Measured
 from tests.support.daemon import HELLO, Driver, at_work, link_to, robot_behind_proxy
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
 from tests.support.scenario import ServedRobot, SurveyLoop, begin, config_of, mirror_of
-from tests.unit.test_robot_link import robot
+from tests.unit.links.test_robot_link import robot
 
 FRAMES = 60
 KEY = b"secret"

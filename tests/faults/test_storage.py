@@ -18,8 +18,8 @@ from ccatp.daemon.supervision.process import LogStream, open_log
 from ccatp.records.store import MissionStore, StoredPoint, StoreError
 from tests.faults.linking import Measured
 from tests.support.sim_survey import Desk, serving
-from tests.unit.test_recorder import full_beyond
-from tests.unit.test_store import hold
+from tests.unit.records.test_recorder import full_beyond
+from tests.unit.records.test_store import hold
 
 POINTS = [PointId(row, col, n) for row in range(1, 10) for col in range(1, 9) for n in range(1, 10)][: 77 * 9]
 FIX = Fix(1.5, (1.0, 2.0, 3.0), (1e-12,) * 9, 1.7, (1, 2, 5, 8), 2e-6)

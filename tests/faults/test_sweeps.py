@@ -23,11 +23,11 @@ from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.robot import Robot
 from ccatp.studies.faults_study import random_plan
 from ccatp.studies.sil_run import SilResult, SilRun
-from tests.faults import edge_sweep
-from tests.faults.edge_sweep import Tally, rim_case, rim_cases, seam_case, speed_of, sweep, turn_case, turn_cases
 from tests.faults.linking import Measured
 from tests.support.scenario import config_of, one_panel
 from tests.support.sim_survey import plan_of
+from tools import edge_sweep
+from tools.edge_sweep import Tally, rim_case, rim_cases, seam_case, speed_of, sweep, turn_case, turn_cases
 
 # Random plans of faults that pass by; of such missions this share has to be completed.
 MISSIONS = int(os.environ.get("CCATP_FAULT_PLANS", "40"))

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from mcap.opcode import Opcode
 
 from ccatp.records.recorder import MAGIC, TELEMETRY, Recorder, iter_messages, read_metadata
-from tests.unit.reporting.recorded import recorder_in
+from tests.support.recorded import recorder_in
 
 KINDS = ("reboot", "wrap", "back", "ahead", "damage")
 _BYTES = 9  # of a record's head: opcode and length

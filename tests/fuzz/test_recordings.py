@@ -21,7 +21,7 @@ from ccatp.cli import main
 from ccatp.core import FloatArray
 from tests.faults.linking import Measured
 from tests.fuzz.recordings import Spoiling, cases, spoil
-from tests.unit.reporting.recorded import record
+from tests.support.recorded import record
 
 SEED = 1
 COUNT = 120

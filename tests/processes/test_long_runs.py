@@ -11,8 +11,8 @@ import pytest
 
 from tests.faults.linking import Measured
 from tests.processes.conftest import Start
-from tests.processes.kill_campaign import run_mission
-from tests.processes.night import Night, ccatp, morning, spend
+from tools.kill_campaign import run_mission
+from tools.night import Night, ccatp, morning, spend
 
 # -- random kills ------------------------------------------------------------------------------------------------------
 

@@ -32,10 +32,10 @@ from ccatp.links.client import HttpClient, OperatorClient
 from ccatp.links.topics import DisplayState
 from ccatp.records.recorder import iter_messages
 from ccatp.studies.sil_run import rehearse
-from tests.docs.generated import DOCS, ROOT
 from tests.docs.test_docs import blocks
 from tests.processes.conftest import Start
 from tests.support.runs import NO_CALIBRATION, Run
+from tools.generated_docs import DOCS, ROOT
 
 WITH_PAGE = ("--set", "dashboard.enabled=true", "--set", "dashboard.port=0")
 URL = re.compile(r"http://127\.0\.0\.1:(\d+)/")

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from tests.processes.onboard_reactions import TRIALS, Program, driving, measure
 from tests.support import foreign_robot
+from tools.onboard_reactions import TRIALS, Program, driving, measure
 
 
 @pytest.mark.parametrize(

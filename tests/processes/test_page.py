@@ -18,10 +18,10 @@ from ccatp.beacons.config.load import load_radio_config
 from ccatp.config.package import configs_dir
 from ccatp.report.dashboard.view import MAX_LINES, MAX_SAMPLES
 from tests.processes.conftest import Start
-from tests.processes.page_load import CHROMIUM, FLAGS, MESSAGE_EVERY_S, load
 from tests.processes.test_observers import WITH_PAGE, ask, open_page, page_port
 from tests.processes.test_replay import BeaconRun
 from tests.support.runs import Run
+from tools.page_load import CHROMIUM, FLAGS, MESSAGE_EVERY_S, load
 
 PATIENCE_MS = 30_000
 expect.set_options(timeout=PATIENCE_MS)  # on two busy cores a robot may be held for want of frames, and go on
@@ -225,7 +225,7 @@ PLAYED_S, PER_S, PAGES = 7200, 600.0, 50
 MOST_PAGE_MB, MOST_GROWTH_MB = 30.0, 150.0
 
 
-@pytest.mark.slow  # a minute; the rules by which rows are left out are tried in tests/unit/dashboard
+@pytest.mark.slow  # a minute; the rules by which rows are left out are tried in tests/unit/report/dashboard
 def test_two_hours_within_seconds_are_held_in_bounded_memory_and_fifty_pages_are_served() -> None:
     with load() as loaded:
         before = loaded.held()

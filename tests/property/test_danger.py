@@ -1,4 +1,4 @@
-"""Properties of the edge rule on the real mirrors, with the plant and the drives of ``tests.faults.edge_sweep``."""
+"""Properties of the edge rule on the real mirrors, with the plant and the drives of ``tools.edge_sweep``."""
 
 from functools import lru_cache
 from math import atan2, copysign, cos, hypot, pi, radians, sin
@@ -9,7 +9,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from ccatp.core import DeckPose, PointId
-from tests.faults.edge_sweep import BLIND, MIRRORS, OVERRUN_M, Drive, Error, Tally, places, run_off, world
+from tools.edge_sweep import BLIND, MIRRORS, OVERRUN_M, Drive, Error, Tally, places, run_off, world
 
 names = st.sampled_from(MIRRORS)
 spots = st.integers(0, 100_000)  # on the rim

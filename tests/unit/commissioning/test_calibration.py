@@ -22,7 +22,7 @@ from ccatp.records.recorder import RECORD_FORMAT
 from ccatp.sim.robot import Robot
 from ccatp.studies.sil_run import SilRun
 from tests.support.command import answered, printed, refused
-from tests.unit.reporting.recorded import recorder_in
+from tests.support.recorded import recorder_in
 
 # A robot that is not what the configuration says, in a world without slip: thesis with these.
 OTHER_ROBOT = {

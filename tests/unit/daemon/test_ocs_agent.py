@@ -15,7 +15,7 @@ from ccatp.daemon.operator import ocs_agent
 from ccatp.daemon.operator.ocs_agent import SurveyTask, add_arguments, main, register, survey_command
 from ccatp.errors import ConfigError
 from ccatp.links.client import OperatorClient
-from tests.unit.test_keys import serving, status
+from tests.unit.links.test_auth import serving, status
 
 
 class Session:

@@ -15,8 +15,8 @@ from ccatp.errors import ExitStatus
 from ccatp.links.liveness import RateLimitedLog, kind_of
 from ccatp.links.topics import DangerEvent, LogMessage, MissionStatus, TrackMessage
 from ccatp.survey.events import MissionState
+from tests.support.recorded import make_run, record_beacons
 from tests.support.scenario import world_of
-from tests.unit.reporting.recorded import make_run, record_beacons
 
 CFG, _ = world_of()
 STATUS = MissionStatus(seq=-1, t_s=0.0, state="driving", elapsed_s=61.0, eta_s=9.0, done=1, total=10)

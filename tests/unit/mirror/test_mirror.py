@@ -14,7 +14,7 @@ from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.panel_alignment import deviations_of
 from ccatp.mirror.surface import ConvergenceError, UnknownPanelError
-from tests.unit.aligning.test_panel_alignment import exact_fix
+from tests.unit.mirror.test_panel_alignment import exact_fix
 
 POSE = DeckPose(1.1, -1.7, 0.6)
 LEVEL = PanelMisalignment(0.0, 0.0, 0.0)

@@ -15,7 +15,7 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.multilateration import MultilaterationError, multilaterate, solve_fix
 from ccatp.mirror.panel_alignment import deviations_of, fit_panels
-from tests.unit.aligning.test_panel_alignment import exact_fix
+from tests.unit.mirror.test_panel_alignment import exact_fix
 
 HEIGHT_M = 0.05
 PANEL = PanelId(3, 7)

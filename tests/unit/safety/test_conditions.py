@@ -307,7 +307,7 @@ ELSEWHERE = {
         *(rows.RIM_AHEAD, rows.BEYOND_SEAM, rows.NO_SEAM, rows.OFF_WITHOUT_WHEELS, rows.CENTRE_NEAR_RIM),
         *(rows.ALL_OFF, rows.EARTHQUAKE, rows.EMERGENCY),
     ),
-    "tests/unit/safety/test_sample_times.py": (rows.SAMPLES_MISDATED,),
+    "tests/unit/sensing/test_sample_times.py": (rows.SAMPLES_MISDATED,),
     "tests/unit/safety/test_grip.py": (
         rows.GRIP_LOST,
         rows.GRIP_LITTLE,
