@@ -56,7 +56,7 @@ class MissionKind:
     processes: Part = Part("ccatp.daemon.supervision.supervisor:WITHOUT_LASER")  # tuple[ProcessSpec, ...]
     record: Part = Part("ccatp.records.run_record:status_record")  # Callable[[C, Path, RobotClock, bool], RunRecord]
     # Main loop, danger loop, simulated robot.
-    runner: Part  # Callable[[C, ProcessArgs], AbstractContextManager[Callable[[MainLoop], MissionRunner]]]
+    runner: Part  # Callable[[C, ProcessArgs], AbstractContextManager[Callable[[MissionHost], MissionRunner]]]
     limits: Part = Part("ccatp.daemon.loops.mission_runner:usual_limits")  # Callable[[C], LoopLimits]
     rules: Part = Part("ccatp.safety.rules:emergency_rules")  # Callable[[C], safety.rules.SafetyRules]
     stand_in: Part  # Callable[[C, dataloop.StandInOptions], dataloop.StandIn]

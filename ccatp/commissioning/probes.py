@@ -45,7 +45,7 @@ from ccatp.daemon.supervision.child_processes import (
 from ccatp.daemon.supervision.supervisor import PROCESSES
 from ccatp.errors import CcatpError, ConfigError
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
-from ccatp.links.robot_link import ImpossibleRobot, RobotLink, RobotLinkError
+from ccatp.links.robot_link import ImpossibleRobot, LinkHandler, RobotLink, RobotLinkError
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.runtime_dir import make_runtime_dir
 from ccatp.mirror.mirror import Mirror, build_mirror
@@ -140,7 +140,7 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
         return without(failed(str(error), "see ccatp keys"), "no robot link")
     link = RobotLink(
         host=cfg.robot.host, port=cfg.robot.port, role="monitor", client="check", key=key,
-        on_sensors=take, on_lost=is_lost.set_result, on_joined=hellos.append,
+        handler=LinkHandler(on_sensors=take, on_lost=is_lost.set_result, on_joined=hellos.append),
     )  # fmt: skip
     try:
         await link.connect(cfg.robot.connect_timeout_s)

@@ -5,6 +5,7 @@ import os
 import socket
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import cast
 
 from ccatp.config.robot_limits import hello_problems
@@ -100,17 +101,33 @@ class LineWriter:
             transport.write(data[written:])
 
 
+@dataclass(frozen=True, slots=True)
+class LinkHandler:
+    """What is called on the events of a session, within the event loop's read.
+
+    Attributes:
+        on_sensors: with each frame and its line (without LF).
+        on_lost: once, with the reason, when a joined session ends, unless ``close`` ended it.
+        on_joined: with the robot's hello when the session begins, before its first frame.
+        on_first: with the first frame, before ``on_sensors``.
+        on_bad_line: after each line of a joined session that fails a check.
+        on_repeated: when the newest frame comes unchanged again.
+    """
+
+    on_sensors: Callable[[Sensors, bytes], None]
+    on_lost: Callable[[str], None]
+    on_joined: Callable[[Hello], None] = lambda _hello: None
+    on_first: Callable[[Sensors], None] = lambda _sensors: None
+    on_bad_line: Callable[[], None] = lambda: None
+    on_repeated: Callable[[], None] = lambda: None
+
+
 class RobotLink(asyncio.Protocol):
     """One session with the robot.
 
     Frames that are not newer than the last one are dropped and counted, and so are bad lines; neither reaches the
-    caller. While the robot does not take what was sent, drives and permits are dropped and counted: a burst of old
+    handler. While the robot does not take what was sent, drives and permits are dropped and counted: a burst of old
     commands must never follow a stall.
-
-    ``on_sensors`` is called with each frame and its line (without LF), within the event loop's read; ``on_lost`` once
-    with the reason when a joined session ends, unless ``close`` ended it; ``on_joined`` with the robot's hello when the
-    session begins, before its first frame; ``on_first`` with its first frame, before ``on_sensors``; ``on_bad_line``
-    after each line of a joined session that fails a check; ``on_repeated`` when its newest frame comes unchanged again.
 
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
@@ -127,16 +144,14 @@ class RobotLink(asyncio.Protocol):
         role: Role,
         client: str,
         key: bytes | None,
-        on_sensors: Callable[[Sensors, bytes], None],
-        on_lost: Callable[[str], None],
-        on_joined: Callable[[Hello], None] = lambda _hello: None,
-        on_bad_line: Callable[[], None] = lambda: None,
-        on_repeated: Callable[[], None] = lambda: None,
-        on_first: Callable[[Sensors], None] = lambda _sensors: None,
+        handler: LinkHandler,
     ) -> None:
-        self._host, self._port, self._role, self._client, self._key = host, port, role, client, key
-        self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
-        self._on_bad_line, self._on_repeated, self._on_first = on_bad_line, on_repeated, on_first
+        self._host = host
+        self._port = port
+        self._role = role
+        self._client = client
+        self._key = key
+        self._handler = handler
         self.counts: Counter[str] = Counter()
         self._transport: asyncio.Transport | None = None
         self._writer: LineWriter | None = None
@@ -209,9 +224,9 @@ class RobotLink(asyncio.Protocol):
                 continue
             if type(message) is Sensors and self._is_joined and message.seq > self._last_seq:
                 if self._last_seq < 0:
-                    self._on_first(message)
+                    self._handler.on_first(message)
                 self._last_seq, self.newest = message.seq, message
-                self._on_sensors(message, line)
+                self._handler.on_sensors(message, line)
             else:
                 self._take(message)
         if self._lines.error is not None:
@@ -227,7 +242,7 @@ class RobotLink(asyncio.Protocol):
                 self._joining.set_exception(RobotLinkError(f"the robot at {self._where} did not let us join: {why}"))
         elif self._is_joined and not self._is_closing:
             self._is_joined = False
-            self._on_lost(why)
+            self._handler.on_lost(why)
 
     def pause_writing(self) -> None:
         self._is_paused = True
@@ -244,7 +259,7 @@ class RobotLink(asyncio.Protocol):
             self.counts["repeated_frames" if self._is_joined else "unexpected"] += 1
             newest = self.newest if self._is_joined else None
             if newest is not None and (message.seq, message.t) == (newest.seq, newest.t):
-                self._on_repeated()
+                self._handler.on_repeated()
         elif joining is None or joining.done():
             self.counts["unexpected"] += 1
         elif isinstance(message, Refused):
@@ -257,7 +272,7 @@ class RobotLink(asyncio.Protocol):
                 rate_hz = self._hello.frame_hz
                 self._budget = BadLineLimit(BACKLOG_S * rate_hz, FLOOD_FACTOR * rate_hz)
             joining.set_result(self._hello)
-            self._on_joined(self._hello)
+            self._handler.on_joined(self._hello)
         else:
             if isinstance(message, Joined) and message.role != self._role:
                 self._oddity = f"joined as {message.role}, not as {self._role}"
@@ -293,7 +308,7 @@ class RobotLink(asyncio.Protocol):
         if self._bad.add(asyncio.get_running_loop().time(), reason):
             self.abort(f"too many bad lines from the robot, the first: {self._bad.first_reason}")
         elif self._is_joined:
-            self._on_bad_line()
+            self._handler.on_bad_line()
 
     def abort(self, why: str) -> None:
         """Break the connection at once, whatever waits to be sent; ``on_lost`` is called with ``why``."""

@@ -18,7 +18,7 @@ from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, Fix, FloatArray, Measured, PanelPose, PointId, Verdict, unreliable_points
 from ccatp.daemon.loops.mission_runner import STILL, DriveCommand, TimedFrame
-from ccatp.daemon.loops.survey_runner import SurveyFrames
+from ccatp.daemon.loops.survey_pipeline import SurveyPipeline
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import MotorRobot, motor_robot
 from ccatp.estimation.fixes import FixGated, FixRefused
@@ -26,7 +26,7 @@ from ccatp.kinematics import difference
 from ccatp.links import multiline
 from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import EstimateMessage, is_estimate_due
+from ccatp.links.topics import EstimateMessage, TreatmentKind, is_estimate_due
 from ccatp.localizer import Localizer
 from ccatp.mirror.fix_judgement import FixJudge
 from ccatp.mirror.mirror import Mirror
@@ -43,6 +43,7 @@ from ccatp.survey.composition import SurveyParts, assemble
 from ccatp.survey.events import DONE, FixFailed, FixStored, MissionState, PointMissed, SurveyOutcome
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.route_follower import StateEstimate
+from ccatp.survey.statechart import Mission
 
 # A mission that takes this many times its bound hangs; the robot's own deadlines should have ended it long before.
 _ENDLESS = 6.0
@@ -191,7 +192,7 @@ class NoFrames(RuntimeError):
     """The robot sends no frame any more, which no plan of passing faults causes."""
 
 
-class SilRun(SurveyFrames):
+class SilRun:
     """The processes' parts side by side; a subclass may exchange some before ``run``, or override a frame.
 
     ``faults``: of the robot. A frame that cannot be decoded is passed over, one that is not newer is answered with
@@ -199,8 +200,11 @@ class SilRun(SurveyFrames):
     """
 
     def __init__(self, cfg: Config, faults: FaultPlan | None = None) -> None:
-        parts = assemble(cfg)
-        super().__init__(cfg, parts, 1.0 / cfg.sim.robot.frame_hz)
+        self.cfg = cfg
+        self.parts = parts = assemble(cfg)
+        self.mirror = parts.mirror
+        self.thrust = parts.thrust
+        self.pipeline = SurveyPipeline(cfg, parts, 1.0 / cfg.sim.robot.frame_hz, self)
         self.robot: Robot | MotorRobot = (
             Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed), faults)
             if cfg.sim.robot.physics == "lag"
@@ -219,6 +223,16 @@ class SilRun(SurveyFrames):
         self._time = SteadyTime(cfg.health.clock_jump_s)
         self._fans_seq = 0
         self._is_measuring = False
+
+    @property
+    def localizer(self) -> Localizer:
+        """That of the pipeline."""
+        return self.pipeline.localizer
+
+    @property
+    def mission(self) -> Mission:
+        """That of the pipeline."""
+        return self.pipeline.mission
 
     @property
     def injected(self) -> tuple[Injected, ...]:
@@ -280,7 +294,7 @@ class SilRun(SurveyFrames):
         if self.mirror.overhang and robot.fans.thrust < self.cfg.sim.robot.fan_floor:
             self.weak_frames += 1
         if dt_s <= 0.0:
-            self.estimate(frame)
+            self.pipeline.estimate(frame)
             self._drive(STILL)
             return
         # Main publishes a pose in five frames; the verdict on a frame waits for the newest that is due before it.
@@ -289,8 +303,8 @@ class SilRun(SurveyFrames):
         if verdict.code is not self._code:
             self._code = verdict.code
             self.trace.builder.add_verdict_event(sensors.seq, verdict.code)
-        self.estimate(frame)
-        drive = self.plan(frame, before, 0.0)  # the decision in a frame goes by the verdict on the one before
+        self.pipeline.estimate(frame)
+        drive = self.pipeline.plan(frame, before, 0.0)  # the decision in a frame goes by the verdict on the one before
         self.states_s[self.mission.state.mode] += dt_s
         self._publish(frame)
         if self._is_measuring:
@@ -300,7 +314,17 @@ class SilRun(SurveyFrames):
         robot.permit(self._drive_seq + 1, *verdict.permits)
         self._drive(drive)
 
-    def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
+    def record_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
+        """Nothing is recorded."""
+
+    def after_requests(self, sensors: Sensors) -> None:
+        """Nothing is reported."""
+
+    def report_grip(self) -> None:
+        """Nothing is reported."""
+
+    def execute(self, command: MissionCommand, motion: StateEstimate) -> None:
+        """Measure at the end of the frame; see ``SurveySink``."""
         self._is_measuring = command.measure
         if command.at_rest:
             self.localizer.rest()
@@ -315,14 +339,14 @@ class SilRun(SurveyFrames):
     def _drive(self, drive: DriveCommand) -> None:
         self._drive_seq = number = self._drive_seq + 1
         right, left = drive.right_rad_s, drive.left_rad_s
-        self.sent.add(number, right, left)
+        self.pipeline.sent.add(number, right, left)
         self.robot.drive(number, set_point_on_wire(right), set_point_on_wire(left))
 
     def _publish(self, frame: TimedFrame) -> None:
         sensors = frame.sensors
         self.trace.note_estimate(sensors.seq, sensors.t, self.localizer.pose)
         if frame.is_estimate_due:
-            self._published = self._estimate_message(frame)
+            self._published = self.pipeline.estimate_message(frame)
 
     # -- a measurement, as in daemon.loops.fix_service ----------------------------------------------------------------
 

@@ -141,13 +141,15 @@ class _Replica(SilRun):
         block = [p.panel for p in self.parts.points if p.row in _BLOCK and p.col in _BLOCK]
         kept = list(dict.fromkeys(block))[: panels or None]
         outside = [p for p in self.parts.points if p.panel not in kept]
-        self.parts = parts = assemble(cfg, done=outside)
+        self.parts = self.pipeline.parts = parts = assemble(cfg, done=outside)
         self.monitor = _NoEdges(self.mirror, cfg.robot, cfg.danger)
-        self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
+        self.pipeline.localizer = parts.localizer
+        self.pipeline.mission = parts.mission
+        self.pipeline.gate = parts.gate
         if cfg.run.filter == "kf":
             localizer = ThesisLocalizer(cfg, self.mirror, self.mirror.base_panel_pose)
             localizer.period_factor = 1.0 + period_error
-            self.localizer = localizer
+            self.pipeline.localizer = localizer
 
 
 # Thesis 2.3.2 (one run for each noise) and 3.5 (five runs each): share below 1 cm, mean, largest, mm.

@@ -159,7 +159,6 @@ async def _drive_through(config: Config, frames: int) -> list[bytes]:
     lines: list[bytes] = []
     over = asyncio.Event()
     async with running(config) as rig:
-        controller, monitor = link_to(rig.port), link_to(rig.port, "monitor")
 
         def on_frame(sensors: Sensors, line: bytes) -> None:
             lines.append(line)
@@ -172,7 +171,10 @@ async def _drive_through(config: Config, frames: int) -> list[bytes]:
         def on_monitored(sensors: Sensors, line: bytes) -> None:
             monitor.send_permit(sensors.seq, sensors.seq, True, True, sensors.seq % 50 != 0)
 
-        controller._on_sensors, monitor._on_sensors = on_frame, on_monitored
+        controller, monitor = (
+            link_to(rig.port, on_sensors=on_frame),
+            link_to(rig.port, "monitor", on_sensors=on_monitored),
+        )
         await monitor.connect(DEADLINE_S)
         await controller.connect(DEADLINE_S)
         async with asyncio.timeout(DEADLINE_S):

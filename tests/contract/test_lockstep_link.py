@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from ccatp.config.models import Config
-from ccatp.daemon.loops import robot_loop
+from ccatp.daemon.loops import lockstep, robot_loop
 from ccatp.daemon.loops.robot_loop import RobotLoop
 from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.links.robot_codec import RobotFrame, encode
@@ -53,14 +53,14 @@ def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, times_s in (
         (server, {"HOUSEKEEPING_S": 0.02}),
         (sessions, {"REPEAT_S": 0.1}),
-        (robot_loop, {"REPEAT_S": 0.1, "DUPLICATE_S": 0.05, "INVALID_S": 0.05, "OVERDUE_S": 0.3}),
+        (lockstep, {"REPEAT_S": 0.1, "DUPLICATE_S": 0.05, "INVALID_S": 0.05, "OVERDUE_S": 0.3}),
         (robot_loop, {"WAIT_PERIOD_S": 0.005}),
     ):
         for name, time_s in times_s.items():
             monkeypatch.setattr(module, name, time_s)
 
 
-class Answering(RobotLoop):
+class Answering:
     """A controller that drives, or a monitor that permits; both keep what the page asks of a client.
 
     Attributes:
@@ -72,15 +72,20 @@ class Answering(RobotLoop):
 
     def __init__(self, role: Role, cfg: Config, folder: Path, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         name = "main" if role == "controller" else "danger"
-        super().__init__(name, role, ProcessArgs(cfg, folder, Endpoints(folder), None, False, False), context)
-        peer: Any = SimpleNamespace(maintain=lambda: None)
-        self.peer = peer
+        self.peer: Any = SimpleNamespace(maintain=lambda: None)
+        self._role = role
+        args = ProcessArgs(cfg, folder, Endpoints(folder), None, False, False)
+        self.loop = RobotLoop(name, role, args, context, self)
+        self.session = self.loop.session
         self.frames, self.reports, self.losses = list[int](), list[str](), list[str]()
         self.sent, self.withheld = list[tuple[int, int, tuple[float, ...]]](), set[int]()
         self._newest: tuple[int, tuple[float, ...]] | None = None
 
     def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
-        return self.watch(), self.serve()
+        return ()
+
+    async def connect(self) -> None:
+        """There is only the robot."""
 
     def is_peer_ready(self) -> bool:
         return True
@@ -88,12 +93,27 @@ class Answering(RobotLoop):
     async def end(self, _stop: asyncio.Event) -> None:
         """Nothing to say."""
 
+    async def close(self) -> None:
+        """Nothing to close."""
+
+    def on_restarted(self) -> None:
+        raise AssertionError("the robot does not restart")
+
+    def on_bad_line(self) -> None:
+        """The loop reports it."""
+
+    def report_bad_line(self, text: str) -> None:
+        """Not what is asked for here."""
+
+    def publish_levels(self) -> None:
+        """Nobody listens."""
+
     def is_frame_due(self) -> bool:
         return self._role == "controller" and (not self.frames or self.frames[-1] not in self.withheld)
 
     def on_joined(self, hello: Hello) -> None:
         self._newest = None
-        self.begin_session()
+        self.loop.begin_session()
 
     def on_lost(self, reason: str) -> None:
         self.losses.append(reason)
@@ -105,7 +125,7 @@ class Answering(RobotLoop):
         self.reports.append(text)
 
     def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:
-        self.heartbeat.frame_s = CLOCK.monotonic()
+        self.loop.heartbeat.frame_s = CLOCK.monotonic()
         self.frames.append(sensors.seq)
         if sensors.seq not in self.withheld:
             self.answer(sensors.seq)
@@ -121,9 +141,9 @@ class Answering(RobotLoop):
         number, (ack, values) = len(self.sent), self._newest
         self.sent.append((number, ack, values))
         if self._role == "controller":
-            self.link.send_drive(number, ack, *values)
+            self.session.link.send_drive(number, ack, *values)
         else:
-            self.link.send_permit(number, ack, *map(bool, values))
+            self.session.link.send_permit(number, ack, *map(bool, values))
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -167,13 +187,13 @@ async def running(folder: Path) -> AsyncIterator[Rig]:
             proxy = await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=1))
             client = Answering(role, config_of(run__seed=SEED, robot__port=proxy.port), folder, context)
             rig.proxies[role], rig.clients[role] = proxy, client
-            await client.join(is_patient=False)
-            tasks += [asyncio.create_task(service) for service in client.services()]
+            await client.session.join(is_patient=False)
+            tasks += [asyncio.create_task(service) for service in (client.loop.watch(), client.session.serve())]
         try:
             yield rig
         finally:
             for client in rig.clients.values():
-                client.leave()
+                client.session.leave()
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -299,7 +319,7 @@ async def test_a_robot_that_waits_for_the_other_client_is_reported(tmp_path: Pat
 async def test_a_connection_that_is_silent_is_dropped_and_the_next_one_continues(
     tmp_path: Path, role: Role, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(robot_loop, "LOCKSTEP_SILENCE_S", 0.6)
+    monkeypatch.setattr(lockstep, "LOCKSTEP_SILENCE_S", 0.6)
     async with running(tmp_path) as rig:
         client, proxy = rig.clients[role], rig.proxies[role]
         await rig.drive(5)
@@ -309,7 +329,7 @@ async def test_a_connection_that_is_silent_is_dropped_and_the_next_one_continues
         proxy.heal()
         stood_at = rig.robot.robot.seq
         await rig.drive(stood_at + 5)
-        assert client.sessions >= 2
+        assert client.session.count >= 2
 
 
 # -- robots that break the page ---------------------------------------------------------------------------------------
@@ -330,7 +350,7 @@ FRAME = encode(RobotFrame(0, 0.0, [(0.0, 0.0, 0.25)], (), (), None, (0.0, 0.0), 
 async def test_a_robot_without_a_valid_first_frame_is_reported_and_given_up(
     tmp_path: Path, frame: bytes, sends: str, role: Role, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(robot_loop, "LOCKSTEP_SILENCE_S", 0.6)
+    monkeypatch.setattr(lockstep, "LOCKSTEP_SILENCE_S", 0.6)
     joined = rounds = 0
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -352,12 +372,12 @@ async def test_a_robot_without_a_valid_first_frame_is_reported_and_given_up(
     async with scripted(talk) as port:
         cfg = config_of(robot__port=port, robot__reconnect_timeout_s=1.0)
         client = Answering(role, cfg, tmp_path, context)
-        await client.join(is_patient=False)
-        watching = asyncio.create_task(client.watch())
+        await client.session.join(is_patient=False)
+        watching = asyncio.create_task(client.loop.watch())
         if role == "controller":
             with pytest.raises(RobotTimeout, match="it accepts the session and sends no valid frame"):
                 async with asyncio.timeout(DEADLINE_S):
-                    await client.serve()
+                    await client.session.serve()
             assert joined >= 2
             assert "not even the last one again" in client.losses[0]
             assert client.reports[0].endswith(sends)
@@ -366,7 +386,7 @@ async def test_a_robot_without_a_valid_first_frame_is_reported_and_given_up(
             assert joined == 1
             assert [report.endswith(sends) for report in client.reports] == ([True] if frame else [])
         watching.cancel()
-        client.leave()
+        client.session.leave()
         await asyncio.gather(watching, return_exceptions=True)
     context.destroy(linger=0)
     assert not client.sent

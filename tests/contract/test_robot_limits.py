@@ -22,11 +22,11 @@ from ccatp.config.robot_limits import (
     Limits,
     hello_problems,
 )
-from ccatp.daemon.loops.robot_session import RobotSession
+from ccatp.daemon.loops.robot_session import RobotSession, SessionHandler
 from ccatp.errors import ConfigError
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_link import ImpossibleRobot
-from ccatp.links.robot_messages import Hello, Joined, Sensors
+from ccatp.links.robot_messages import Hello, Joined
 from tests.faults.linking import Measured
 from tests.support.daemon import HELLO
 from tests.support.scenario import boot, config_of, mirror_of, radio_config_of
@@ -56,15 +56,8 @@ def with_value(hello: Hello, name: str, value: float) -> Hello:
     return replace(hello, robot=replace(robot, max_wheel_rad_s=value / robot.wheel_radius_m))
 
 
-class Client(RobotSession):
-    def on_joined(self, hello: Hello) -> None:
-        """Nothing to begin."""
-
-    def on_lost(self, reason: str) -> None:
-        """Nothing to lose."""
-
-    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
-        """No frame comes."""
+# No frame comes.
+NOTHING = SessionHandler(on_sensors=lambda *_: None, on_joined=lambda _: None, on_lost=lambda _: None)
 
 
 async def is_joined(hello: Hello) -> bool:
@@ -83,7 +76,7 @@ async def is_joined(hello: Hello) -> bool:
     async with scripted(talk) as port:
         cfg = load_config(overrides={"robot.port": port, "robot.reconnect_timeout_s": 20.0})
         for role, is_patient in (("controller", False), ("monitor", True)):  # the patient one tries only once, too
-            client = Client(cfg.robot, role, "test")  # type: ignore[arg-type]
+            client = RobotSession(cfg.robot, role, "test", NOTHING)  # type: ignore[arg-type]
             with suppress(ImpossibleRobot):
                 async with asyncio.timeout(5.0):
                     await client.join(is_patient=is_patient)
@@ -159,7 +152,7 @@ async def test_the_refusal_names_the_robot_the_value_and_its_limits() -> None:
         await reader.readline()
 
     async with scripted(talk) as port:
-        client = Client(load_config(overrides={"robot.port": port}).robot, "controller", "test")
+        client = RobotSession(load_config(overrides={"robot.port": port}).robot, "controller", "test", NOTHING)
         says = (
             rf"the robot at 127\.0\.0\.1:{port} cannot be driven: "
             r"frame_hz is 1 Hz, the robot link allows 20 to 200 Hz; "

@@ -113,7 +113,7 @@ class AttackedSurvey(SilRun):
         pose, deck = self.robot.world.plant.pose, self.localizer.deck_pose
         off_m = hypot(pose.x_m - deck.x_m, pose.y_m - deck.y_m)
         limit_m = max(_TOLERANCE_M, _SIGMAS * self.localizer.position_sigma_m)
-        is_moving = self.sent.rates != (0.0, 0.0) and not sensors.cmd.held
+        is_moving = self.pipeline.sent.rates != (0.0, 0.0) and not sensors.cmd.held
         self._wrong_s = self._wrong_s + dt_s if is_moving and off_m > limit_m else 0.0
         if self._wrong_s > _RUNDOWN_S and not self.wrong:
             self.wrong.append(f"moves at {self.robot.t_s:.2f} s while the pose is {1e3 * off_m:.1f} mm off")

@@ -22,6 +22,7 @@ from ccatp.conditions import text_of
 from ccatp.core import Cause
 from ccatp.daemon.loops.danger_loop import DangerLoop
 from ccatp.daemon.loops.main_loop import MainLoop
+from ccatp.daemon.loops.robot_loop import RobotLoop
 from ccatp.errors import ExitStatus
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
@@ -96,13 +97,11 @@ async def test_a_main_loop_whose_mission_is_over_waits_for_a_supervisor_that_is_
 
 # Every task that the two loops serve, by the method that it runs.
 TASKS = (
-    "ccatp.daemon.loops.main_loop.MainLoop.publish_heartbeat",
-    "ccatp.daemon.loops.main_loop.MainLoop.watch",
-    "ccatp.daemon.loops.danger_loop.DangerLoop.publish_heartbeat",
-    "ccatp.daemon.loops.danger_loop.DangerLoop.watch",
+    "ccatp.daemon.loops.robot_loop.RobotLoop.publish_heartbeat",
+    "ccatp.daemon.loops.robot_loop.RobotLoop.watch",
     "ccatp.daemon.loops.fix_service.FixService.run",
     "ccatp.daemon.loops.robot_session.RobotSession.serve",
-    "ccatp.daemon.loops.main_loop.MainLoop._serve_operator",
+    "ccatp.daemon.operator.operator_channel.OperatorServer.serve",
     "ccatp.daemon.operator.observatory.ObservatoryServer.serve",
 )
 
@@ -141,9 +140,9 @@ async def test_a_task_that_breaks_ends_its_loop_by_that_exception(task: str, mea
 
 @pytest.mark.fault("P9")
 def test_the_tasks_are_those_that_the_loops_serve() -> None:
-    """The coroutines in the ``services`` of both loops, read from their source."""
+    """The coroutines in the ``services`` of both loops and of what they have in common, read from their source."""
     found = set[str]()
-    for loop in (MainLoop, DangerLoop):
+    for loop in (MainLoop, DangerLoop, RobotLoop):
         for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(loop.services)))):
             if isinstance(node, ast.Return):
                 assert isinstance(node.value, ast.Tuple)
@@ -296,7 +295,7 @@ async def test_a_robot_on_another_mirror_is_refused(measured: Measured) -> None:
     reported, real = configuration("fyst-m1"), configuration("fyst-m2")
     async with running_daemon(reported, real) as daemon:
         duty = daemon.robot.robot.fans.duty
-        await daemon.until(daemon.main.over.is_set)
+        await daemon.until(daemon.main.loop.over.is_set)
         assert daemon.main.exit_status == ExitStatus.USAGE, tell(daemon)
         (line,) = (entry["text"] for entry in daemon.log if "right mirror" in entry.get("text", ""))
         assert "fyst-m1 has one of 24.7 deg there" in line

@@ -208,7 +208,7 @@ def test_whoever_takes_over_in_a_fire_finds_the_heading_and_goes_home(is_before:
     assert (run.states == [MissionState.RETURNING]) is is_before
     assert len(run.states) == 1
     assert (result.outcome, result.cause) == ("aborted, at base", "emergency: fire")
-    assert run.gate.denied[Denial.ABORTED] == 0  # it drove to find its heading, too
+    assert run.pipeline.gate.denied[Denial.ABORTED] == 0  # it drove to find its heading, too
     assert result.summary["danger"]["falls"] == 0
 
 

@@ -24,7 +24,7 @@ from ccatp.core import DeckPose, PanelId, Twist
 from ccatp.daemon.supervision.process import Endpoints
 from ccatp.kinematics import twist_of, wheel_rates
 from ccatp.links.bus import Publisher, Subscriber
-from ccatp.links.robot_link import RobotLink
+from ccatp.links.robot_link import LinkHandler, RobotLink
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import DangerEvent, EstimateMessage, Heartbeat, TruthMessage
 from ccatp.mirror.mirror import build_mirror
@@ -167,7 +167,7 @@ async def check(case: RimCase, run_dir: Path, runtime_dir: Path) -> None:
                 await asyncio.sleep(0.02)
             link = RobotLink(
                 host=cfg.robot.host, port=port, role="controller", client="reckless", key=None,
-                on_sensors=lambda sensors, _raw: main.on_sensors(link, sensors), on_lost=lambda _reason: None,
+                handler=LinkHandler(lambda sensors, _raw: main.on_sensors(link, sensors), lambda _reason: None),
             )  # fmt: skip
             await link.connect(5.0)
             clearances: dict[int, float] = {}

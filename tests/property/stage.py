@@ -175,14 +175,14 @@ class Stage(SilRun):
             self._verdict = verdict = self.monitor.step(frame, self._published)
             self._permit_seq += 1
             self.robot.permit(self._permit_seq, verdict.forward, verdict.reverse, verdict.turn)
-        self.estimate(timed)
+        self.pipeline.estimate(timed)
         if dt_s <= 0.0:
             self._drive(STILL)
             return
         verdict = self._verdict
         if verdict is not None and not abs(t_s - verdict.t_s) <= FRESH_S:
             verdict = None
-        drive = self.plan(timed, verdict, 0.0)
+        drive = self.pipeline.plan(timed, verdict, 0.0)
         self._publish(timed)
         if self._is_measuring:
             self._is_measuring = False

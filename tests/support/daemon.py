@@ -22,7 +22,7 @@ from ccatp.core import PanelPose
 from ccatp.daemon.loops.danger_loop import DangerLoop
 from ccatp.daemon.loops.main_loop import MainLoop, open_runner
 from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
-from ccatp.links.robot_link import RobotLink
+from ccatp.links.robot_link import LinkHandler, RobotLink
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role, Sensors
 from ccatp.localizer import Localizer, build_localizer
 from ccatp.onboard.rules import MotionRules
@@ -206,7 +206,7 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
         recorder.subscribe("track")
         stack.enter_context(daemon.watching())
         async with asyncio.TaskGroup() as tasks:
-            daemon.loops = [tasks.create_task(loop.run(stop)) for loop in (daemon.main, daemon.danger)]
+            daemon.loops = [tasks.create_task(one.loop.run(stop)) for one in (daemon.main, daemon.danger)]
             try:
                 yield daemon
             finally:
@@ -227,10 +227,18 @@ def tell(daemon: Daemon) -> str:
 # -- the robot link alone ---------------------------------------------------------------------------------------------
 
 
-def link_to(port: int, role: Role = "controller", kind: type[RobotLink] = RobotLink, **more: Any) -> RobotLink:
-    """A client's end; ``more``: its key, and what it calls."""
-    given = {"key": None, "on_sensors": lambda *_: None, "on_lost": lambda _: None} | more
-    return kind(host="127.0.0.1", port=port, role=role, client="test", **given)
+def link_to(
+    port: int,
+    role: Role = "controller",
+    kind: type[RobotLink] = RobotLink,
+    *,
+    key: bytes | None = None,
+    **events: Callable[..., Any],
+) -> RobotLink:
+    """A client's end; ``events``: what it calls, as in ``LinkHandler``."""
+    given: dict[str, Callable[..., Any]] = {"on_sensors": lambda *_: None, "on_lost": lambda _: None}
+    handler = LinkHandler(**(given | events))
+    return kind(host="127.0.0.1", port=port, role=role, client="test", key=key, handler=handler)
 
 
 class Waiting:

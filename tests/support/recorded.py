@@ -152,8 +152,8 @@ class RecordingRun(MeasuredSurvey):
         self.lines.append(msgspec.Raw(encode(frame).strip()))
         super()._serve(frame, dt_s)
 
-    def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
-        super()._execute(command, motion)
+    def execute(self, command: MissionCommand, motion: StateEstimate) -> None:
+        super().execute(command, motion)
         if command.at_rest:
             self.write("rest", Rest(seq=self.seq, t_s=self.t_s))
         if command.arrived is not None:

@@ -91,7 +91,7 @@ class Watched(SilRun):
         deck, robot = self.localizer.deck_pose, self.robot
         place = robot.world.plant.pose
         verdict, estimate = self.monitor.verdict, (deck.x_m, deck.y_m)
-        drive = executed(self.sent.rates, verdict)
+        drive = executed(self.pipeline.sent.rates, verdict)
         now = Seen(robot.t_s, verdict, self.mission.state.mode, drive, place, estimate)
         self.seen.append(now)
         if self._is_enough(now):
@@ -394,5 +394,7 @@ class RestartedSurvey(SilRun):
         parts = take_over(cfg, checkpoint, TakenOver(before.done, before.skipped, checkpoint.elapsed_s))
         truth, pose = self.robot.world.plant, checkpoint.pose
         self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / checkpoint.sigmas(cfg.limits)[0])
-        self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
-        self.sent = SentDrives(cfg.robot, self.robot.frame_s)
+        self.pipeline.localizer = parts.localizer
+        self.pipeline.mission = parts.mission
+        self.pipeline.gate = parts.gate
+        self.pipeline.sent = SentDrives(cfg.robot, self.robot.frame_s)

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from math import cos, inf, sin
-from typing import TYPE_CHECKING
 
 from ccatp.beacons.conditions import FRAMES_MISSED
 from ccatp.beacons.config.models import RadioConfig
@@ -17,7 +16,15 @@ from ccatp.beacons.records.store import BeaconStore
 from ccatp.beacons.steering import HALT
 from ccatp.conditions import text_of
 from ccatp.core import Verdict
-from ccatp.daemon.loops.mission_runner import EXIT_STATUS, STILL, DriveCommand, LoopLimits, MissionRunner, TimedFrame
+from ccatp.daemon.loops.mission_runner import (
+    EXIT_STATUS,
+    STILL,
+    DriveCommand,
+    LoopLimits,
+    MissionHost,
+    MissionRunner,
+    TimedFrame,
+)
 from ccatp.daemon.supervision.process import ProcessArgs
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Telemetry
@@ -25,9 +32,6 @@ from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello
 from ccatp.links.topics import DisplayState, EstimateMessage, MissionStatus, RobotShape, Scene
 from ccatp.survey.events import DONE, HELD, IDLE, RETURNING, Fault
-
-if TYPE_CHECKING:
-    from ccatp.daemon.loops.main_loop import MainLoop
 
 ECHO_MEMORY = 200  # number of recent echoes of the distance sensors, for displays
 TRAIL = 400  # number of places of the robot, one in five frames
@@ -49,9 +53,12 @@ class BeaconRunner(MissionRunner):
 
     mission: BeaconMission
 
-    def __init__(self, cfg: RadioConfig, loop: "MainLoop", mission: BeaconMission, store: BeaconStore) -> None:
-        super().__init__(mission, Telemetry(loop.publisher, loop.log, "beacon_track", BeaconTrack))
-        self._cfg, self._loop, self._clock, self._store = cfg, loop, loop.clock, store
+    def __init__(self, cfg: RadioConfig, host: MissionHost, mission: BeaconMission, store: BeaconStore) -> None:
+        super().__init__(mission, Telemetry(host.publisher, host.log, "beacon_track", BeaconTrack))
+        self._cfg = cfg
+        self._host = host
+        self._clock = host.clock
+        self._store = store
         self._reader = MeasurementReader(cfg)
         self._measurements: BeaconMeasurements | None = None
         self._speed_m_s = 0.0
@@ -125,11 +132,11 @@ class BeaconRunner(MissionRunner):
             self._store.record_event(self._clock.t_s, "warning", text)
         if mode is DONE:
             self._publish_map(self.telemetry.seq, self.telemetry.t_s)
-            self._loop.finish(EXIT_STATUS[state.outcome])
-        elif state.is_faulted and self._loop.is_lockstep:
+            self._host.finish(EXIT_STATUS[state.outcome])
+        elif state.is_faulted and self._host.is_lockstep:
             # No operator can react while simulated time runs at many times the wall clock.
             self._publish_map(self.telemetry.seq, self.telemetry.t_s)
-            self._loop.finish(ExitStatus.HELD)
+            self._host.finish(ExitStatus.HELD)
 
     def log_statistics(self) -> None:
         """Log the consistency of the readings."""
@@ -154,7 +161,7 @@ class BeaconRunner(MissionRunner):
         mission = self.mission
         if self._measurements is None:
             raise RuntimeError("plan comes after estimate")
-        drive = mission.step(self._measurements, self._loop.frame_period_s, verdict)
+        drive = mission.step(self._measurements, self._host.frame_period_s, verdict)
         if mission.state.mode is DONE:
             drive = HALT
         self._speed_m_s = drive.speed_m_s
@@ -253,13 +260,13 @@ class BeaconRunner(MissionRunner):
 
 
 @contextmanager
-def open_beacons(cfg: RadioConfig, args: ProcessArgs) -> Iterator[Callable[["MainLoop"], BeaconRunner]]:
+def open_beacons(cfg: RadioConfig, args: ProcessArgs) -> Iterator[Callable[[MissionHost], BeaconRunner]]:
     """Open the database of a mission among beacons; yields a factory of the mission."""
     mission = BeaconMission(cfg)
     laps = 0 if cfg.follow.is_active else cfg.mission.laps
     meta = {"system": cfg.system, "seed": str(cfg.run.seed)}
     store = BeaconStore(args.run_dir / "mission.sqlite", meta, cfg.workspace.waypoints_m, laps)
     try:
-        yield lambda loop: BeaconRunner(cfg, loop, mission, store)
+        yield lambda host: BeaconRunner(cfg, host, mission, store)
     finally:
         store.close()

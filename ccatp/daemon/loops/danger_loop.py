@@ -12,10 +12,11 @@ import uuid
 from collections.abc import Coroutine
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import structlog
 import zmq
+import zmq.asyncio
 
 from ccatp.conditions import text_of
 from ccatp.config.files import read_text, sync_folder
@@ -115,21 +116,40 @@ class PersistentEmergencyLatch(EmergencyLatch):
             os.posix_fallocate(file.fileno(), 0, RESERVE_BYTES)
 
 
-class DangerLoop(RobotLoop):
-    """Connects the monitor to the robot link, the bus and the observatory channel."""
+class PublishedVerdict(NamedTuple):
+    """What the last event had: the verdict, the names of all findings, and the active emergencies."""
+
+    code: EventCode = EventCode.NORMAL
+    cause: Cause = NO_CAUSE
+    severity: Severity = Severity.NONE
+    findings: frozenset[str] = frozenset()
+    emergencies: tuple[Cause, ...] = ()
+
+    @property
+    def verdict(self) -> tuple[EventCode, Cause, Severity]:
+        """The part of the verdict alone."""
+        return self[:3]
+
+
+class DangerLoop:
+    """Connects the monitor to the robot link, the bus and the observatory channel: the work of the danger process."""
 
     def __init__(self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        super().__init__("danger", "monitor", args, context)
+        self.loop = RobotLoop("danger", "monitor", args, context, self)
+        self.session = self.loop.session
+        self.log = self.loop.log
+        self.heartbeat = self.loop.heartbeat
+        self._context = context
         self._cfg = cfg = args.config
         self.monitor: SafetyRules = kind_of(cfg).rules.get()(cfg)
         self.monitor.latch = PersistentEmergencyLatch(args.run_dir / EMERGENCIES_FILE, self.log)
-        self.peer = self._estimates = EstimateSubscriber(
+        self.peer = EstimateSubscriber(
             context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
         )
         self._has_estimate = False
-        self._published: tuple[EventCode, Cause, Severity, frozenset[str], list[Cause]]
-        self._published = EventCode.NORMAL, NO_CAUSE, Severity.NONE, frozenset(), []
-        self._seq, self._t_s = -1, 0.0
+        self._published = PublishedVerdict()
+        self._seq = -1
+        self._t_s = 0.0
         self._bad_lines = 0
         self._permits = PermitRule()
         self._is_stale = False
@@ -142,28 +162,37 @@ class DangerLoop(RobotLoop):
         )
 
     def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
-        return self._observatory.serve(self._shadow), self.publish_heartbeat(), self.watch(), self.serve()
+        return (self._observatory.serve(zmq.asyncio.Context.shadow(self._context)),)
+
+    async def connect(self) -> None:
+        """There is no peer but the robot and the main loop."""
 
     def is_peer_ready(self) -> bool:
         """Whether messages arrive in both directions, so that the first ones are not lost."""
-        self._has_estimate = self._has_estimate or self._estimates.has_received()
-        return self._has_estimate and self.publisher.has_subscriber("verdict")
+        self._has_estimate = self._has_estimate or self.peer.has_received()
+        return self._has_estimate and self.loop.publisher.has_subscriber("verdict")
 
     async def end(self, _stop: asyncio.Event) -> None:
         self.log.info("danger_statistics", **self.monitor.counts)
 
+    async def close(self) -> None:
+        """The process ends."""
+
+    def publish_levels(self) -> None:
+        """The verdict is published with each frame."""
+
     def on_joined(self, hello: Hello) -> None:
         self._permits.begin_session()
         self.monitor.limit_wheels(hello.robot.max_wheel_rad_s)
-        self.begin_session()
-        port = self.robot_cfg.port
-        self.log.info("robot_joined", port=port, lockstep=hello.lockstep, session=self.sessions)
+        self.loop.begin_session()
+        port = self.session.cfg.port
+        self.log.info("robot_joined", port=port, lockstep=hello.lockstep, session=self.session.count)
 
     def on_restarted(self) -> None:
         self.monitor.reset()
-        if self.hello is not None:
-            self.monitor.limit_wheels(self.hello.robot.max_wheel_rad_s)
-        self._estimates.reset()
+        if self.session.hello is not None:
+            self.monitor.limit_wheels(self.session.hello.robot.max_wheel_rad_s)
+        self.peer.reset()
         self._permits.restart()
         self._seq = -1
 
@@ -183,31 +212,33 @@ class DangerLoop(RobotLoop):
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
         """Judge one frame. In lockstep it waits for main's estimate of a certain frame, so that a run is repeatable."""
-        is_lockstep = self.is_lockstep
-        self._seq, self._t_s, self.heartbeat.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
+        is_lockstep = self.session.is_lockstep
+        self._seq = sensors.seq
+        self._t_s = sensors.t
+        self.heartbeat.frame_s = time.monotonic()
+        self._is_stale = False
         self._bad_lines = 0
-        if not self._permits.take(self.frame_id(sensors)):
+        if not self._permits.take(self.session.frame_id(sensors)):
             # The last frame of the session before: its samples are not taken twice.
             self._publish_verdict(self.monitor.stale(sensors.seq, sensors.t), sensors.seq)
             return
-        estimate = self._estimates.latest(sensors.seq, is_lockstep=is_lockstep)
+        estimate = self.peer.latest(sensors.seq, is_lockstep=is_lockstep)
         try:
             verdict = self.monitor.judge(sensors, raw, estimate)
         except Exception as error:
             # Without a verdict the robot's permit expires, and the robot holds by itself.
             self.log.exception("unhandled_exception", seq=self._seq)
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-            self.over.set()
+            self.loop.over.set()
             return
-        if not is_lockstep and self.lateness.add(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
+        if not is_lockstep and self.loop.lateness.add(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
             verdict = self.monitor.stale(sensors.seq, sensors.t)  # too late: this verdict would be on an old frame
         self._publish_verdict(verdict, sensors.seq)
 
     def on_bad_line(self) -> None:
         """In lockstep each bad line counts as the period of a frame, so that a run is repeatable."""
-        super().on_bad_line()
         self._bad_lines += 1
-        hello = self.hello
+        hello = self.session.hello
         is_timed = hello is not None and hello.lockstep
         at_s = self._t_s + self._bad_lines / hello.frame_hz if hello and is_timed else time.monotonic()
         verdict = self.monitor.garbled(self._seq, self._t_s, at_s)
@@ -217,7 +248,14 @@ class DangerLoop(RobotLoop):
     def answer_again(self) -> None:
         permit = self._permits.permit()
         if permit is not None:
-            self.link.send_permit(permit.seq, permit.ack, permit.forward, permit.reverse, permit.turn)
+            self.session.link.send_permit(permit.seq, permit.ack, permit.forward, permit.reverse, permit.turn)
+
+    def is_frame_due(self) -> bool:
+        """Never for this loop: main decides when a frame is answered."""
+        return False
+
+    def report_bad_line(self, text: str) -> None:
+        """Main tells the operator."""
 
     def report_overdue(self, text: str) -> None:
         self.log.warning("frame_overdue", text=text)
@@ -226,16 +264,16 @@ class DangerLoop(RobotLoop):
         if ack >= 0:  # the permit first, without waiting for the publication
             self._permits.judge(verdict)
             self.answer_again()
-        self.publisher.send("verdict", verdict)
-        if not (verdict.cause or self._published[1]):  # still no cause, so there is no finding either
+        self.loop.publisher.send("verdict", verdict)
+        if not (verdict.cause or self._published.cause):  # still no cause, so there is no finding either
             return
         found, emergencies = self.monitor.found, self.monitor.latch.causes
         names = frozenset(finding.condition.name for finding in found)
-        news = verdict.code, verdict.cause, verdict.severity, names, emergencies
-        if news == self._published:
+        news = PublishedVerdict(verdict.code, verdict.cause, verdict.severity, names, tuple(emergencies))
+        before, self._published = self._published, news
+        if news == before:
             return
-        is_verdict_new = news[:3] != self._published[:3]
-        self._published = news
+        is_verdict_new = news.verdict != before.verdict
         active = [ActiveCause(one.condition.name, text_of(one.cause), one.severity) for one in found]
         others = [verdict.cause, *(cause for cause in emergencies if cause != verdict.cause)]
         active += [active_cause(cause) for cause in others if cause and cause not in [one.cause for one in found]]
@@ -244,7 +282,7 @@ class DangerLoop(RobotLoop):
         fields |= {"code": int(verdict.code), "severity": int(verdict.severity)}
         listed = [(name, cause, int(severity)) for name, cause, severity in active]
         event = DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, active=listed, **fields)
-        self.publisher.send("danger_event", event)
+        self.loop.publisher.send("danger_event", event)
         if is_verdict_new:  # otherwise only other findings began or ended; the list of alarms has them
             self.log.info("verdict_changed", seq=verdict.seq, t_s=verdict.t_s, **fields)
 
@@ -254,7 +292,7 @@ def main() -> int:
     args = start_process()
 
     async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:
-        await DangerLoop(args, context).run(stop)
+        await DangerLoop(args, context).loop.run(stop)
         return 0 if stop.is_set() else int(ExitStatus.HELD)
 
     return run_process("danger", serve)

@@ -13,10 +13,12 @@ from math import inf
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
+import structlog
 
+from ccatp.clocks import MissionClock
 from ccatp.core import Cause, Verdict
 from ccatp.errors import ExitStatus
-from ccatp.links.bus import Telemetry
+from ccatp.links.bus import Publisher, Telemetry
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import DisplayState, MissionStatus
 from ccatp.survey.events import SurveyInput, SurveyOutcome
@@ -71,6 +73,28 @@ class LoopLimits(NamedTuple):
 def usual_limits(_cfg: object) -> LoopLimits:
     """Limits for a robot that cannot relocalize: a pause becomes a fault without a fix before."""
     return LoopLimits(clock_jump_s=0.1, pause_s=inf, hold_s=30.0)
+
+
+class MissionHost(Protocol):
+    """What a mission's runner needs of the main loop, which holds the runner."""
+
+    publisher: Publisher
+    log: structlog.typing.FilteringBoundLogger
+    clock: MissionClock
+    frame_period_s: float  # of the present session
+
+    @property
+    def is_lockstep(self) -> bool:
+        """Simulated time waits for the answers."""
+
+    def release_time(self) -> None:
+        """After a change between two frames, such as the end of a measurement: continue lockstep time."""
+
+    def send_fans(self, seq: int, duty: tuple[float, float]) -> None:
+        """Send fan duties (left, right), 0 to 1."""
+
+    def finish(self, status: ExitStatus) -> None:
+        """End the process with a status, after the last messages are sent."""
 
 
 class RunningMission(Protocol):

@@ -1,54 +1,95 @@
-"""Common base of main loop and danger loop: session with the robot, bus, and tasks that end together."""
+"""What main loop and danger loop have in common: a session with the robot, heartbeats, and tasks that end together."""
 
 import asyncio
 import gc
 import time
-from abc import abstractmethod
 from collections.abc import Coroutine
-from typing import Any
+from typing import Any, Protocol
 
 import zmq
 import zmq.asyncio
 
-from ccatp.daemon.loops.robot_session import LatenessStatistics, RobotSession
+from ccatp.daemon.loops.lockstep import LockstepAnswers, LockstepWatch
+from ccatp.daemon.loops.robot_session import LatenessStatistics, RobotSession, SessionHandler
 from ccatp.daemon.supervision.process import ProcessArgs, open_log, unless_stopped
 from ccatp.links import realtime
 from ccatp.links.bus import PERIOD_S, HeartbeatPublisher, PeerSubscriber, Publisher
-from ccatp.links.robot_messages import Role
+from ccatp.links.robot_messages import Hello, Role, Sensors
 
 WAIT_PERIOD_S = 0.02
-# In lockstep the robot sends the next frame as soon as it has its answers, or repeats the last one after a second.
-REPEAT_S = 1.0
-# A copy of a frame that arrives sooner is a duplicated line and needs no answer.
-DUPLICATE_S = 0.5
-# A missing frame is reported after the first time; after an invalid line, whose frame the robot repeats, after the
-# second one.
-OVERDUE_S, INVALID_S = 3.0, 0.5
-LOCKSTEP_SILENCE_S = 30.0
 
 
-class RobotLoop(RobotSession):
-    """A loop with a session at the robot. ``peer``: messages of the other loop; ``over``: the loop ends by itself."""
+class LoopWork(LockstepAnswers, Protocol):
+    """The work of a loop, which ``RobotLoop`` runs: that of the main loop, or of the danger loop."""
 
-    peer: PeerSubscriber
+    @property
+    def peer(self) -> PeerSubscriber:
+        """Messages of the other loop."""
 
-    def __init__(self, name: str, role: Role, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        super().__init__(args.config.robot, role, name)
+    async def connect(self) -> None:
+        """Connect to peers other than the robot and the other loop."""
+
+    def is_peer_ready(self) -> bool:
+        """Whether messages reach the other loop, and it is ready for this one to join."""
+
+    def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
+        """The services that run besides the frames."""
+
+    async def end(self, stop: asyncio.Event) -> None:
+        """Send the last messages, write the last lines of the log."""
+
+    async def close(self) -> None:
+        """Close the resources of ``connect``."""
+
+    def on_joined(self, hello: Hello) -> None:
+        """Begin a session, before its first frame."""
+
+    def on_restarted(self) -> None:
+        """The robot restarted since the last session, before the first frame of this one."""
+
+    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
+        """Serve one frame; ``raw``: its line. In lockstep a session begins with a repetition of the last frame."""
+
+    def on_bad_line(self) -> None:
+        """Handle an invalid line; the first one of a session is reported already."""
+
+    def on_silence(self, age_s: float) -> None:
+        """Handle the age of the newest frame; called periodically in real time, also while frames are prompt."""
+
+    def on_lost(self, reason: str) -> None:
+        """Handle the loss of the session; the robot holds itself."""
+
+    def publish_levels(self) -> None:
+        """Publish the levels, which are repeated with the heartbeat."""
+
+    def report_bad_line(self, text: str) -> None:
+        """Report the first bad line of a session to the operator; for each loop it is in the log."""
+
+
+class RobotLoop:
+    """Runs the work of a loop with a session at the robot. ``over``: set when the loop ends by itself."""
+
+    def __init__(
+        self, name: str, role: Role, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]], work: LoopWork
+    ) -> None:
         self._args = args
-        self._shadow = zmq.asyncio.Context.shadow(context)
+        self._work = work
         self.log = open_log(args.run_dir / "log.jsonl", name)
         self.publisher = Publisher(context, args.endpoints.of(name))
         self.heartbeat = HeartbeatPublisher(self.publisher, name)
-        self.lateness = LatenessStatistics(self.robot_cfg.slip_after_s)
+        self.lateness = LatenessStatistics(args.config.robot.slip_after_s)
         self.over = asyncio.Event()
-        # In lockstep, by the monotonic clock: start of the session, last repeated frame, last repeated answer, last
-        # invalid line, and the frame whose successor was reported as overdue.
-        self._joined_s = self._repeated_s = self._answered_again_s = self._invalid_s = self._reported_s = 0.0
+        handler = SessionHandler(
+            on_sensors=work.on_sensors,
+            on_joined=work.on_joined,
+            on_lost=work.on_lost,
+            on_restarted=work.on_restarted,
+            on_bad_line=self._on_bad_line,
+            on_repeated=self._on_repeated,
+        )
+        self.session = RobotSession(args.config.robot, role, name, handler)
+        self._lockstep = LockstepWatch(self.session, work)
         self._explained = 0  # the newest session whose first bad line is reported
-        self._counted: tuple[float, int] = (
-            0.0,
-            0,
-        )  # time of the newest frame, frames with old numbers until then
 
     async def run(self, stop: asyncio.Event) -> None:
         """Join the robot together with the other loop, then serve frames until ``over`` or ``stop`` is set."""
@@ -57,138 +98,73 @@ class RobotLoop(RobotSession):
             try:
                 await self._join(stop)
                 await unless_stopped(stop, self.over.wait())
-                await self.end(stop)
+                await self._work.end(stop)
             finally:
                 for task in served:
                     task.cancel()
-                self.leave()
-                await self.close()
+                self.session.leave()
+                await self._work.close()
+
+    def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
+        """The services of every loop, and those of its work."""
+        return *self._work.services(), self.publish_heartbeat(), self.session.serve(), self.watch()
 
     async def _join(self, stop: asyncio.Event) -> None:
-        if not await unless_stopped(stop, self.connect()):
+        if not await unless_stopped(stop, self._work.connect()):
             return
-        while not self.is_peer_ready():
+        while not self._work.is_peer_ready():
             if stop.is_set():
                 return
             await asyncio.sleep(WAIT_PERIOD_S)
         gc.freeze()  # otherwise a collection during the run visits all objects of the libraries, for about 50 ms
-        joins = self.join(is_patient=self._args.is_taking_over)
-        if await unless_stopped(stop, joins) and not self.is_lockstep:
+        joins = self.session.join(is_patient=self._args.is_taking_over)
+        if await unless_stopped(stop, joins) and not self.session.is_lockstep:
             realtime.enter(self._args.config.processes.realtime_priority, self.log)
-
-    @abstractmethod
-    def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
-        """The services that run besides the frames."""
-
-    async def connect(self) -> None:
-        """Connect to peers other than the robot and the other loop."""
-
-    @abstractmethod
-    def is_peer_ready(self) -> bool:
-        """Whether messages reach the other loop, and it is ready for this one to join."""
-
-    @abstractmethod
-    async def end(self, stop: asyncio.Event) -> None:
-        """Send the last messages, write the last lines of the log."""
-
-    async def close(self) -> None:
-        """Close the resources of ``connect``."""
-
-    def publish_levels(self) -> None:
-        """Publish the levels, which are repeated with the heartbeat."""
-
-    def is_frame_due(self) -> bool:
-        """In lockstep: whether the last frame was answered, so that the robot has to send the next one."""
-        return False
-
-    @abstractmethod
-    def answer_again(self) -> None:
-        """Repeat the last answer of the session, if any, with a new number."""
-
-    @abstractmethod
-    def report_overdue(self, text: str) -> None:
-        """Report that a frame is missing in lockstep, so that the robot stands."""
-
-    def on_bad_line(self) -> None:
-        """See ``RobotSession``."""
-        self._invalid_s = time.monotonic()
-        if self._explained != self.sessions:  # below the limit of bad lines no other line says what is wrong with them
-            self._explained = self.sessions
-            self.log.warning("bad_line", session=self.sessions, reason=self.link.first_bad_line)
-            self.report_bad_line(
-                f"a line of the robot is not valid: {self.link.first_bad_line}; 'ccatp conformance' checks the firmware"
-            )
-
-    def report_bad_line(self, text: str) -> None:
-        """Report the first bad line of a session to the operator; for each loop it is in the log."""
-
-    def on_repeated(self) -> None:
-        """In lockstep the robot repeats a frame when it has not received an answer of this or the other loop."""
-        if self.is_lockstep:
-            self._repeated_s = time.monotonic()
-            self._answer_again_after(DUPLICATE_S)
-
-    def _answer_again_after(self, quiet_s: float) -> None:
-        now_s = time.monotonic()
-        if now_s - max(self.heartbeat.frame_s or 0.0, self._answered_again_s) >= quiet_s:
-            self._answered_again_s = now_s
-            self.answer_again()
-
-    def _watch_lockstep(self, frame_s: float) -> None:
-        """Repeat the answer each second, report a missing frame, and drop the connection to a silent robot.
-
-        The answer is also repeated while a newer one is withheld, to keep the session.
-        """
-        self._answer_again_after(REPEAT_S)
-        now_s = time.monotonic()
-        age_s, silent_s = now_s - frame_s, now_s - max(frame_s, self._repeated_s)
-        old = self.link.counts["repeated_frames"]
-        if self._counted[0] != frame_s:
-            self._counted = frame_s, old
-        is_invalid, is_repeated = self._invalid_s > frame_s, self._repeated_s > frame_s
-        is_overdue = age_s > INVALID_S if is_invalid else age_s > OVERDUE_S and self.is_frame_due()
-        if is_overdue and self._reported_s != frame_s:
-            self._reported_s = frame_s
-            sends = (
-                "a line that is not valid" if is_invalid
-                else "its last frame again" if is_repeated
-                else "frames with older numbers" if old > self._counted[1]
-                else "nothing"
-            )  # fmt: skip
-            self.report_overdue(f"the robot stands: no new frame for {age_s:.1f} s in lockstep; it sends {sends}")
-        # The monitor receives no frames before a controller has joined.
-        if silent_s > LOCKSTEP_SILENCE_S and (self._role == "controller" or frame_s > self._joined_s):
-            self.drop(f"no sensors frame for {silent_s:.0f} s in lockstep, not even the last one again")
-
-    @abstractmethod
-    def on_silence(self, age_s: float) -> None:
-        """Handle the age of the newest frame; called periodically in real time, also while frames are prompt."""
 
     def begin_session(self) -> None:
         """Begin a session: restart the statistics of lateness and the age of the frames."""
         self.lateness.reset()
-        self._joined_s = time.monotonic()
-        self.heartbeat.phase, self.heartbeat.frame_s = "joined", self._joined_s
+        now_s = time.monotonic()
+        self._lockstep.begin_session(now_s)
+        self.heartbeat.phase = "joined"
+        self.heartbeat.frame_s = now_s
 
     async def publish_heartbeat(self) -> None:
         """Publish periodically, until cancelled."""
         while True:
             self.heartbeat.publish()
-            self.publish_levels()
+            self._work.publish_levels()
             await asyncio.sleep(PERIOD_S)
 
     async def watch(self) -> None:
         """Handle missing frames, and drop a silent connection; until cancelled."""
         while True:
             await asyncio.sleep(WAIT_PERIOD_S)
-            self.peer.maintain()
+            self._work.peer.maintain()
             frame_s = self.heartbeat.frame_s
             if self.heartbeat.phase != "joined" or frame_s is None:
                 continue
-            if self.is_lockstep:
-                self._watch_lockstep(frame_s)
+            now_s = time.monotonic()
+            if self.session.is_lockstep:
+                self._lockstep.check(now_s, frame_s)
                 continue
-            age_s = time.monotonic() - frame_s
-            self.on_silence(age_s)
-            if age_s > self.robot_cfg.silence_timeout_s:
-                self.drop(f"no sensors frame for {age_s:.2f} s")
+            age_s = now_s - frame_s
+            self._work.on_silence(age_s)
+            if age_s > self.session.cfg.silence_timeout_s:
+                self.session.drop(f"no sensors frame for {age_s:.2f} s")
+
+    def _on_bad_line(self) -> None:
+        self._lockstep.on_bad_line(time.monotonic())
+        session = self.session
+        if self._explained != session.count:  # below the limit of bad lines no other line says what is wrong with them
+            self._explained = session.count
+            reason = session.link.first_bad_line
+            self.log.warning("bad_line", session=session.count, reason=reason)
+            self._work.report_bad_line(
+                f"a line of the robot is not valid: {reason}; 'ccatp conformance' checks the firmware"
+            )
+        self._work.on_bad_line()
+
+    def _on_repeated(self) -> None:
+        if self.session.is_lockstep:
+            self._lockstep.on_repeated(time.monotonic(), self.heartbeat.frame_s)

@@ -1,20 +1,18 @@
 """The survey of a mirror in the main-loop process: localizer, mission, gate, laser system, fans, store."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ccatp.conditions import UNATTENDED_FAULT, text_of
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
-from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import NO_CAUSE, Cause, Verdict
 from ccatp.daemon.loops.checkpoints import build_parts
 from ccatp.daemon.loops.fix_service import FixRequest, FixService
-from ccatp.daemon.loops.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
+from ccatp.daemon.loops.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionHost, MissionRunner, TimedFrame
+from ccatp.daemon.loops.survey_pipeline import SurveyPipeline
 from ccatp.daemon.supervision.process import ProcessArgs
 from ccatp.daemon.supervision.run_dir import read_run_id
 from ccatp.errors import DaemonUnreachableError, ExitStatus
@@ -24,7 +22,6 @@ from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import (
     ArrivalMessage,
     DisplayState,
-    EstimateMessage,
     MissionStatus,
     Rest,
     TrackMessage,
@@ -34,21 +31,16 @@ from ccatp.links.topics import (
 from ccatp.localizer import Localizer
 from ccatp.records.checkpoint import CHECKPOINT_FILE, CheckpointFile
 from ccatp.records.store import MissionStore
-from ccatp.sensing.wheel_means import as_standing
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.composition import Checkpoint, SurveyParts
-from ccatp.survey.events import HELD, Abort, EstimateDiverged, Fault, MissionState, SurveyOutcome, TrackingGap
+from ccatp.survey.events import HELD, Abort, Fault, MissionState, SurveyOutcome, TrackingGap
 from ccatp.survey.fix_gate import FixGate
 from ccatp.survey.laser_follow import LaserFollow
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import SurveyState, by_reason
 from ccatp.survey.statechart import Mission
-
-if TYPE_CHECKING:
-    from ccatp.daemon.loops.main_loop import MainLoop
-
 
 # Period of the checkpoint in frames, ten per second.
 PERIOD_FRAMES = 10
@@ -105,7 +97,8 @@ class GateLog:
     """Reports denials of the gate, the same one at most once in ``DENIAL_REPEAT_S``."""
 
     def __init__(self, gate: DriveGate, notify: Callable[[str, str], None]) -> None:
-        self._gate, self._notify = gate, notify
+        self._gate = gate
+        self._notify = notify
         self._logged_s: dict[Denial, float] = {}
 
     def update(self, t_s: float) -> None:
@@ -126,129 +119,27 @@ class GateLog:
         return {denial.name.lower(): count for denial, count in self._gate.denied.items() if count}
 
 
-class SurveyFrames(ABC):
-    """Processes a survey's frames from samples to set points, in the main loop and in a run in one process.
-
-    Subclasses send, report and record everything else. ``motion``: estimate of the newest frame, None if it is stale.
-    """
-
-    def __init__(self, cfg: Config, parts: SurveyParts, frame_s: float) -> None:
-        self.cfg, self.parts, self.mirror, self.thrust = cfg, parts, parts.mirror, parts.thrust
-        self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
-        self.sent = SentDrives(cfg.robot, frame_s)
-        self.motion: StateEstimate | None = None
-        self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = None, -1
-        self._start, self._is_odometry_off = parts.start, False
-
-    @abstractmethod
-    def begin_drives(self) -> None:
-        """Send the fans' duties, before the first drive and whenever they change."""
-
-    def _publish_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
-        """Record, for a replay, that the samples of a frame are not used as they were received."""
-        del sensors, kind, values
-
-    @abstractmethod
-    def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
-        """Handle a command with ``at_rest`` or ``measure``."""
-
-    def estimate(self, frame: TimedFrame) -> None:
-        """Pass the frame's samples to the localizer, as far as they are trusted."""
-        sensors, mission, localizer = frame.sensors, self.mission, self.localizer
-        start, self._start = self._start, None
-        if start is not None:  # a replay needs the start pose of a localizer that takes over
-            begun, sigmas = start
-            self._publish_treatment(sensors, "begun", (begun.x_m, begun.y_m, begun.heading_rad, *sigmas))
-        state = mission.state
-        is_odometry_off = state.mode is HELD and state.rejects_odometry
-        if is_odometry_off is not self._is_odometry_off:
-            self._is_odometry_off = is_odometry_off
-            self._publish_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")
-        imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
-        echo, set_points = sensors.cmd, None
-        if frame.dt_s > 0.0:
-            acted = self.sent.acted(frame.dt_s, echo.seq, echo.age, echo.permit_age, echo.held)
-            set_points = None if is_odometry_off else acted
-        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity, set_points)
-        if localizer.coasted is not None:  # a replay does not know the drives
-            self._publish_treatment(sensors, "coasted", localizer.coasted)
-        if localizer.hold_cause:
-            # A filter that diverged is frozen until the next fix.
-            mission.handle(EstimateDiverged(localizer.hold_cause, frame.t_s))
-            localizer.clear_hold()
-        if frame.dt_s <= 0.0:
-            self.motion = None
-            return
-        pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
-        place = pose.x_m, pose.y_m, pose.heading_rad
-        ahead = self.sent.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
-        sigmas_of = self._position_sigma_m, self.parts.heading_sigma_rad
-        deck_of, turn_creep_of = self.mirror.deck_pose, self.parts.turn_creep_m_rad
-        self.motion = StateEstimate(
-            frame.t_s, frame.dt_s, pose, deck_of, v, omega, creep, ahead, *sigmas_of, turn_creep_of, localizer.gap_s
-        )
-
-    def _position_sigma_m(self) -> float:
-        return self.localizer.position_sigma_m
-
-    def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
-        """The drive for the mission's velocity, as far as the gate permits it."""
-        mission, motion, sensors = self.mission, self.motion, frame.sensors
-        if motion is None:
-            raise RuntimeError("plan comes after estimate, and not for a stale frame")
-        mission.state, command = mission.survey.step(mission.state, motion, verdict)
-        state = mission.state
-        if command.inflates_covariance or state.wants_calibration or state.full_fans or state.hold.is_fault:
-            self._apply_requests(sensors, command)
-            state = mission.state
-        # The gate compares with the verdict's time, which is the robot's own and may have jumped.
-        right, left = self.gate.pass_through(command.twist, verdict, motion.dt_s, sensors.t, lag_s, state.purpose)
-        if command.at_rest or command.measure:
-            self._execute(command, motion)
-        if frame.is_estimate_due:
-            self._sent_commands = self.sent.take_span(), self.sent.newest
-            turns = state.mode is not MissionState.DRIVING
-            self._measure_grip()
-            if self.thrust.step(motion.t_s, self.localizer.deck_pose, turns=turns):
-                self.begin_drives()
-        return DriveCommand(right, left)
-
-    def _measure_grip(self) -> None:
-        self.parts.measure_grip()
-
-    def _apply_requests(self, sensors: Sensors, command: MissionCommand) -> None:
-        """Execute the requests of the mission before the drive is sent."""
-        health = self.cfg.health
-        if command.inflates_covariance:
-            doubt = health.doubt_position_m, health.doubt_heading_rad
-            self.localizer.inflate_covariance(*doubt)
-            self._publish_treatment(sensors, "doubted", doubt)
-        if self.mission.state.full_fans and self.thrust.give_all():  # thrust first, then the drive
-            self.begin_drives()
-
-    def _estimate_message(self, frame: TimedFrame) -> EstimateMessage:
-        """The estimate for the danger loop."""
-        deck, sensors = self.localizer.deck_pose, frame.sensors
-        place = deck.x_m, deck.y_m, deck.heading_rad, self.localizer.position_sigma_m
-        mode, grip = self.mission.state.mode.value, self.thrust.margin
-        return EstimateMessage(*place, mode, *self._sent_commands, grip, seq=sensors.seq, t_s=sensors.t)
-
-
-class SurveyRunner(SurveyFrames, MissionRunner):
+class SurveyRunner(MissionRunner):
     """A survey in the main-loop process."""
 
     mission: Mission
 
     def __init__(
-        self, cfg: Config, args: ProcessArgs, loop: "MainLoop", parts: SurveyParts, store: MissionStore
+        self, cfg: Config, args: ProcessArgs, host: MissionHost, parts: SurveyParts, store: MissionStore
     ) -> None:
-        SurveyFrames.__init__(self, cfg, parts, 1.0 / cfg.sim.robot.frame_hz)
-        telemetry = Telemetry(loop.publisher, loop.log, "track", TrackMessage)
-        MissionRunner.__init__(self, parts.mission, telemetry, self.sent.add)
-        self._loop, self._clock, self._store = loop, loop.clock, store
+        self._pipeline = SurveyPipeline(cfg, parts, 1.0 / cfg.sim.robot.frame_hz, self)
+        telemetry = Telemetry(host.publisher, host.log, "track", TrackMessage)
+        super().__init__(parts.mission, telemetry, self._pipeline.sent.add)
+        self._cfg = cfg
+        self._host = host
+        self._clock = host.clock
         self._clock.before_s = parts.mission.state.budget.before_s
-        self._gate_log = GateLog(self.gate, self.telemetry.notify_operator)
-        self._fan_gate, self._fans_seq = FanGate(0.0), 0
+        self._store = store
+        self._parts = parts
+        self._localizer = parts.localizer
+        self._gate_log = GateLog(parts.gate, self.telemetry.notify_operator)
+        self._fan_gate = FanGate(0.0)
+        self._fans_seq = 0
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._follow = LaserFollow(cfg)
         self._fix_service = FixService(
@@ -259,9 +150,9 @@ class SurveyRunner(SurveyFrames, MissionRunner):
             self.mission,
             store,
             self.telemetry,
-            loop.release_time,
+            host.release_time,
             # no wait in lockstep, whose time stands still meanwhile
-            lambda: 0.0 if loop.is_lockstep else cfg.etalon.measuring_time_s,
+            lambda: 0.0 if host.is_lockstep else cfg.etalon.measuring_time_s,
             parts.heading_sigma_rad,
             self._follow,
             cfg.etalon.alarm_points,
@@ -283,10 +174,10 @@ class SurveyRunner(SurveyFrames, MissionRunner):
 
     @property
     def is_at_rest(self) -> bool:
-        control = self.cfg.control
+        control = self._cfg.control
         return (
-            abs(self.localizer.speed_m_s) <= control.settle_speed_m_s
-            and abs(self.localizer.rate_rad_s) <= control.settle_rate_rad_s
+            abs(self._localizer.speed_m_s) <= control.settle_speed_m_s
+            and abs(self._localizer.rate_rad_s) <= control.settle_rate_rad_s
         )
 
     def status(self) -> MissionStatus:
@@ -302,20 +193,20 @@ class SurveyRunner(SurveyFrames, MissionRunner):
             condition=cause.condition,
             done=len(state.done),
             skipped=len(state.skipped),
-            total=self.parts.total_points,
+            total=self._parts.total_points,
             point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
             eta_s=round(state.eta_s, 3),
             error_mm=1e3 * self._fix_service.arrival_error_m,
             outcome=str(state.outcome),
-            lower_bound_s=self.parts.lower_bound_s,
+            lower_bound_s=self._parts.lower_bound_s,
             left_out=by_reason(survey.left_out(state)),
-            friction=round(self.thrust.friction, 3),
-            grip=round(self.thrust.margin, 3),
+            friction=round(self._parts.thrust.friction, 3),
+            grip=round(self._parts.thrust.margin, 3),
         )
 
     def display_state(self) -> DisplayState:
         """Deck pose, and the filter's last update."""
-        localizer, telemetry = self.localizer, self.telemetry
+        localizer, telemetry = self._localizer, self.telemetry
         pose, covariance, innovation = localizer.deck_pose, localizer.pose_covariance, localizer.innovation
         return DisplayState(
             seq=telemetry.seq,
@@ -350,20 +241,20 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         await self._etalon.close()
 
     def check_robot(self, hello: Hello) -> None:
-        self.parts.check_robot(hello)
+        self._parts.check_robot(hello)
 
     def begin_session(self, hello: Hello) -> None:
-        self.sent.begin_session(1.0 / hello.frame_hz, hello.ttl_s)
+        self._pipeline.sent.begin_session(1.0 / hello.frame_hz, hello.ttl_s)
         self._checkpoint.boot = hello.boot
         # The robot's own floor applies where the mirror overhangs.
-        self._fan_gate = FanGate(hello.robot.fan_floor if self.mirror.overhang else 0.0)
+        self._fan_gate = FanGate(hello.robot.fan_floor if self._parts.mirror.overhang else 0.0)
 
     def begin_drives(self) -> None:
-        duty = self.thrust.duty
+        duty = self._parts.thrust.duty
         refusal = self._fan_gate.refusal(*duty)
         if refusal is None:
             self._fans_seq += 1
-            self._loop.link.send_fans(self._fans_seq, duty)
+            self._host.send_fans(self._fans_seq, duty)
         else:
             self.telemetry.notify_operator("error", text_of(refusal))
             self.mission.handle(Fault(refusal))
@@ -382,30 +273,26 @@ class SurveyRunner(SurveyFrames, MissionRunner):
 
     def estimate(self, frame: TimedFrame) -> None:
         self._follow.add(frame.sensors.imu, frame.sensors.enc)
-        super().estimate(frame)
+        self._pipeline.estimate(frame)
 
-    def _publish_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
+    def record_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
         self.telemetry.send("treatment", Treatment(seq=sensors.seq, t_s=sensors.t, kind=kind, values=values))
 
     def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
         if self._mirror_check is not None and not self._is_on_mirror(self._mirror_check, frame.sensors):
             return self.hold(frame)
-        drive = super().plan(frame, verdict, lag_s)
-        if self.gate.denial is not None:
+        drive = self._pipeline.plan(frame, verdict, lag_s)
+        if self._parts.gate.denial is not None:
             self._gate_log.update(frame.t_s)
         return drive
 
-    def _measure_grip(self) -> None:
-        """Report the first measured grip, from the turns of the calibration drive."""
-        thrust = self.thrust
-        is_test = not thrust.friction
-        if self.parts.measure_grip() and is_test:
-            text = f"grip: friction {thrust.friction:.2f}, {thrust.margin:.2f} times the thrust that turns need"
-            self.telemetry.notify_operator("info", text)
+    def report_grip(self) -> None:
+        thrust = self._parts.thrust
+        text = f"grip: friction {thrust.friction:.2f}, {thrust.margin:.2f} times the thrust that turns need"
+        self.telemetry.notify_operator("info", text)
 
     def hold(self, frame: TimedFrame) -> DriveCommand:
-        if frame.is_estimate_due:
-            self._sent_commands = self.sent.take_span(), self.sent.newest
+        self._pipeline.hold(frame)
         return STILL
 
     def _is_on_mirror(self, check: MirrorCheck, sensors: Sensors) -> bool:
@@ -414,18 +301,17 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         In lockstep the mission begins at once, and ends if gravity contradicts: a simulation cannot do harm, and a run
         does not depend on this check.
         """
-        if check.update(sensors.t, sensors.gravity, self.localizer.deck_pose):
+        if check.update(sensors.t, sensors.gravity, self._localizer.deck_pose):
             self._mirror_check = None
             if check.warning:
                 self.telemetry.notify_operator("warning", check.warning)
         if check.contradiction:
             self.telemetry.notify_operator("error", check.contradiction)
-            self._loop.finish(ExitStatus.USAGE)
+            self._host.finish(ExitStatus.USAGE)
             return False
-        return self._mirror_check is None or self._loop.is_lockstep
+        return self._mirror_check is None or self._host.is_lockstep
 
-    def _apply_requests(self, sensors: Sensors, command: MissionCommand) -> None:
-        super()._apply_requests(sensors, command)
+    def after_requests(self, sensors: Sensors) -> None:
         state = self.mission.state
         if state.wants_calibration and not self._has_reported_calibration:
             self._has_reported_calibration = True
@@ -435,9 +321,9 @@ class SurveyRunner(SurveyFrames, MissionRunner):
 
     def _check_unattended_fault(self, sensors: Sensors) -> None:
         """Remind operators periodically, and return to base before the battery is too low for that."""
-        mission, timer, pose = self.mission, self._fault_timer, self.localizer.deck_pose
-        is_localized = not (mission.state.is_lost or self.localizer.is_frozen)
-        home_s = home_time_s(self.mirror, self.cfg.limits, pose.x_m, pose.y_m) if is_localized else None
+        mission, timer, pose = self.mission, self._fault_timer, self._localizer.deck_pose
+        is_localized = not (mission.state.is_lost or self._localizer.is_frozen)
+        home_s = home_time_s(self._parts.mirror, self._cfg.limits, pose.x_m, pose.y_m) if is_localized else None
         action = timer.watch(self._clock.t_s, sensors.soc, home_s)
         if action is FaultAction.REMIND:
             held_s = timer.held_s(self._clock.t_s)
@@ -447,10 +333,10 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         elif action is FaultAction.RETURN:
             mission.handle(Abort(UNATTENDED_FAULT.because(charge=sensors.soc)))
 
-    def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
+    def execute(self, command: MissionCommand, motion: StateEstimate) -> None:
         mission, seq = self.mission, self._clock.seq
         if command.at_rest:
-            self.localizer.rest()
+            self._localizer.rest()
             self.telemetry.send("rest", Rest(seq=seq, t_s=motion.t_s))
         if command.arrived is not None:
             error_m = mission.survey.follower.distance_m(mission.state.stop, motion.pose)
@@ -459,8 +345,8 @@ class SurveyRunner(SurveyFrames, MissionRunner):
             self.telemetry.send("arrival", arrival)
             self._store.record_arrival(command.arrived, motion.t_s, error_m)
         if command.measure:
-            pose = self.localizer.deck_pose
-            expected = self.mirror.puck_world(pose, self.cfg.robot.puck_height_m)
+            pose = self._localizer.deck_pose
+            expected = self._parts.mirror.puck_world(pose, self._cfg.robot.puck_height_m)
             # For the localizer, the time of a fix is by the robot's own clock.
             t_s = motion.t_s - self._clock.offset_s
             self._fix_service.begin(
@@ -468,10 +354,10 @@ class SurveyRunner(SurveyFrames, MissionRunner):
             )
 
     def publish(self, frame: TimedFrame) -> None:
-        seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self.localizer
+        seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self._localizer
         pose, sigma_m = localizer.pose, localizer.position_sigma_m
         if frame.is_estimate_due:
-            telemetry.send("estimate", self._estimate_message(frame))
+            telemetry.send("estimate", self._pipeline.estimate_message(frame))
         row = seq + telemetry.frames_before, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
         if self._checkpoint.is_due(seq):
@@ -494,15 +380,15 @@ class SurveyRunner(SurveyFrames, MissionRunner):
         if mode is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
             telemetry.notify_operator("warning", f"returning to base: {text_of(state.cause)}")
         if mode is MissionState.DONE:
-            self._loop.finish(EXIT_STATUS[state.outcome])
-        elif state.is_faulted and self._loop.is_lockstep:
+            self._host.finish(EXIT_STATUS[state.outcome])
+        elif state.is_faulted and self._host.is_lockstep:
             # No operator can react while simulated time runs at many times the wall clock.
-            self._loop.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
+            self._host.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
 
 
 @contextmanager
-def open_survey(cfg: Config, args: ProcessArgs) -> Iterator[Callable[["MainLoop"], SurveyRunner]]:
+def open_survey(cfg: Config, args: ProcessArgs) -> Iterator[Callable[[MissionHost], SurveyRunner]]:
     """Open the parts and the database of a survey, new or taken over; yields a factory of the mission."""
     parts, store = build_parts(cfg, args)
     with store:
-        yield lambda loop: SurveyRunner(cfg, args, loop, parts, store)
+        yield lambda host: SurveyRunner(cfg, args, host, parts, store)

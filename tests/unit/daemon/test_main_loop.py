@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from enum import StrEnum
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,8 +14,9 @@ import zmq
 
 from ccatp.beacons.modes import BeaconMode
 from ccatp.config.load import load_config
-from ccatp.daemon.loops.main_loop import STANDS_REPORT_S, MainLoop
+from ccatp.daemon.loops.main_loop import MainLoop
 from ccatp.daemon.loops.mission_runner import MissionRunner
+from ccatp.daemon.loops.standstill import STANDS_REPORT_S
 from ccatp.daemon.operator.terminal import next_text, status_rows
 from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError, ExitStatus
@@ -24,16 +25,20 @@ from ccatp.survey.events import WAITS_FOR, MissionState, waits_for
 from ccatp.survey.state import HoldState
 
 
-@pytest.fixture
-def loop(tmp_path: Path) -> Iterator[MainLoop]:
-    config = load_config(None, {})
-    args = ProcessArgs(config, tmp_path, Endpoints(tmp_path), None, is_realtime=False, is_resuming=False)
-    runner = SimpleNamespace(status=lambda: MissionStatus(seq=0, t_s=0.0, state="survey"), since_s=0.0, telemetry=None)
+@contextmanager
+def main_loop(folder: Path, runner: SimpleNamespace) -> Iterator[MainLoop]:
+    args = ProcessArgs(load_config(), folder, Endpoints(folder), None, is_realtime=False, is_resuming=False)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     made = MainLoop(args, context, lambda _: cast(MissionRunner, runner))
-    with closing(made.publisher), closing(made._verdicts), closing(made._danger_events):
+    with closing(made.publisher), closing(made.peer), closing(made._alarms):
         yield made
     context.destroy(linger=0)
+
+
+@pytest.fixture
+def loop(tmp_path: Path) -> Iterator[MainLoop]:
+    with main_loop(tmp_path, standing(MissionState.IDLE, [])) as made:
+        yield made
 
 
 def test_a_run_that_ended_publishes_its_status(loop: MainLoop) -> None:
@@ -44,7 +49,7 @@ def test_a_run_that_ended_publishes_its_status(loop: MainLoop) -> None:
 
 def test_the_status_shows_the_first_bad_line_while_bad_lines_are_counted(loop: MainLoop) -> None:
     assert "bad lines" not in dict(status_rows(msgspec.to_builtins(loop.status())))
-    loop.link.counts["bad_lines"], loop.link.first_bad_line = 3, "imu: a number out of range"
+    loop.session.link.counts["bad_lines"], loop.session.link.first_bad_line = 3, "imu: a number out of range"
     shown = dict(status_rows(msgspec.to_builtins(loop.status())))["bad lines"]
     what_to_do = "'ccatp conformance' checks the firmware"
     assert shown == f"3 from the robot, the first: imu: a number out of range; {what_to_do}"
@@ -53,7 +58,7 @@ def test_the_status_shows_the_first_bad_line_while_bad_lines_are_counted(loop: M
 def test_a_process_that_failed_publishes_no_end_of_the_run(loop: MainLoop) -> None:
     # Otherwise the run would end before the supervisor has seen the status of the process, or restarted it.
     loop._fail(ConfigError("the configuration is not of this robot"))
-    assert loop.over.is_set()
+    assert loop.loop.over.is_set()
     assert loop.status().exit_status == -1
 
 
@@ -69,24 +74,24 @@ def standing(mode: StrEnum, said: list[str]) -> SimpleNamespace:
         is_at_rest=True,
         is_busy=False,
         since_s=0.0,
+        on_drive=lambda *_: None,
         status=lambda: MissionStatus(seq=0, t_s=0.0, state=str(mode)),
     )
 
 
 @pytest.mark.parametrize("mode", [*MissionState, *BeaconMode])
 def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
-    loop: MainLoop, monkeypatch: pytest.MonkeyPatch, mode: StrEnum
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: StrEnum
 ) -> None:
     said: list[str] = []
     now_s = 1000.0
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
-    runner = standing(mode, said)
-    loop._runner, loop._telemetry = cast(MissionRunner, runner), runner.telemetry
-    loop.heartbeat.phase = "joined"
-    for _ in range(5):
-        now_s += 0.3 * STANDS_REPORT_S
-        loop.heartbeat.frame_s = now_s
-        loop.publish_levels()
+    with main_loop(tmp_path, standing(mode, said)) as loop:
+        loop.heartbeat.phase = "joined"
+        for _ in range(5):
+            now_s += 0.3 * STANDS_REPORT_S
+            loop.heartbeat.frame_s = now_s
+            loop.publish_levels()
     assert said == [f"the robot stands for 36 s: {mode}, and nothing is wrong: {waits_for(mode)}"]
     assert waits_for(mode)
 

@@ -22,6 +22,7 @@ from ccatp.daemon.loops.robot_session import (
     FrameAge,
     LatenessStatistics,
     RobotSession,
+    SessionHandler,
     delay_s,
 )
 from ccatp.estimation.fixes import FixGated, FixRefused
@@ -45,11 +46,12 @@ def test_the_delay_grows_and_is_spread() -> None:
     assert delay_s(0, 0.0) == FIRST_DELAY_S
 
 
-class Client(RobotSession, Waiting):
-    """A controller that answers every frame with zeros."""
+class Client(Waiting):
+    """What a controller hears of its sessions."""
 
     def __init__(self, cfg: Config) -> None:
-        super().__init__(cfg.robot, "controller", "test")
+        handler = SessionHandler(self.on_sensors, self.on_joined, self.on_lost, on_restarted=self.on_restarted)
+        self.session = RobotSession(cfg.robot, "controller", "test", handler)
         self.hellos: list[Hello] = []
         self.frames: list[int] = []
         self.losses: list[str] = []
@@ -85,8 +87,8 @@ async def with_robot(story: Callable[[Config, SurveyLoop], Coroutine[Any, Any, N
 async def test_a_lost_session_is_followed_by_another_one_with_the_same_frame() -> None:
     async def story(cfg: Config, robot: SurveyLoop) -> None:
         client = Client(cfg)
-        await client.join(is_patient=False)
-        serving = asyncio.create_task(client.serve())
+        await client.session.join(is_patient=False)
+        serving = asyncio.create_task(client.session.serve())
         await client.until(lambda: len(client.frames) == 1)
         for session in range(1, 4):
             robot._drop_all("reset")
@@ -94,12 +96,12 @@ async def test_a_lost_session_is_followed_by_another_one_with_the_same_frame() -
         assert client.frames == [0, 0, 0, 0]  # nobody answered: time stood still
         assert len(client.losses) == 3
         assert len({hello.nonce for hello in client.hellos}) == 4
-        client.drop("silent")
+        client.session.drop("silent")
         await client.until(lambda: len(client.frames) == 5)
         assert client.losses[-1] == "silent"
         assert not client.restarts
         serving.cancel()
-        client.leave()
+        client.session.leave()
         await asyncio.gather(serving, return_exceptions=True)
 
     await with_robot(story)
@@ -139,11 +141,11 @@ async def test_a_restart_shows_in_the_first_frame_of_a_session_also_with_the_sam
 
     async with scripted(talk) as port:
         client = Client(load_config(overrides={"robot.port": port}))
-        await client.join(is_patient=False)
-        serving = asyncio.create_task(client.serve())
+        await client.session.join(is_patient=False)
+        serving = asyncio.create_task(client.session.serve())
         await client.until(lambda: len(client.frames) == 4)
         serving.cancel()
-        client.leave()
+        client.session.leave()
         await asyncio.gather(serving, return_exceptions=True)
     assert client.restarts == restarts
     measured("L15", max((count - 2 for count in client.restarts), default=0))
@@ -154,8 +156,8 @@ async def test_a_robot_that_stays_away_ends_it() -> None:
     async def story(cfg: Config, robot: SurveyLoop) -> None:
         quick = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"reconnect_timeout_s": 0.3})})
         client = Client(quick)
-        await client.join(is_patient=True)
-        serving = asyncio.create_task(client.serve())
+        await client.session.join(is_patient=True)
+        serving = asyncio.create_task(client.session.serve())
         await robot.close()
         with pytest.raises(RobotTimeout, match=r"did not come back within 0\.3 s: cannot reach the robot"):
             await serving
@@ -166,15 +168,15 @@ async def test_a_robot_that_stays_away_ends_it() -> None:
 async def test_only_a_process_that_takes_over_tries_again_for_a_role_that_is_in_use() -> None:
     async def story(cfg: Config, robot: SurveyLoop) -> None:
         first, second = Client(cfg), Client(cfg)
-        await first.join(is_patient=False)
-        joining = asyncio.create_task(second.join(is_patient=True))
+        await first.session.join(is_patient=False)
+        joining = asyncio.create_task(second.session.join(is_patient=True))
         async with asyncio.timeout(20.0):
             while not robot.counts["refused"]:  # noqa: ASYNC110 - the server has no event for it
                 await asyncio.sleep(0.005)
-        first.leave()
+        first.session.leave()
         await joining
         assert len(second.hellos) == 1
-        second.leave()
+        second.session.leave()
 
     await with_robot(story)
 
@@ -195,13 +197,13 @@ async def test_a_robot_that_lets_join_and_gives_no_frame_stays_away() -> None:
     async with await asyncio.start_server(talk, "127.0.0.1", 0) as server:
         port = server.sockets[0].getsockname()[1]
         client = Client(load_config(overrides={"robot.port": port, "robot.reconnect_timeout_s": 1.0}))
-        await client.join(is_patient=False)
+        await client.session.join(is_patient=False)
         with pytest.raises(
             RobotTimeout, match=r"did not come back within 1 s: it accepts the session and sends no valid frame"
         ):
             async with asyncio.timeout(20.0):
-                await client.serve()
-        client.leave()
+                await client.session.serve()
+        client.session.leave()
     assert 2 <= joins <= 10
     assert not client.frames
 

@@ -12,7 +12,7 @@ import structlog
 import zmq
 
 from ccatp.core import Verdict
-from ccatp.daemon.loops.main_loop import STANDS_REPEAT_S, STANDS_REPORT_S, StandstillReport
+from ccatp.daemon.loops.standstill import STANDS_REPEAT_S, STANDS_REPORT_S, StandstillReport
 from ccatp.links import bus as bus_module
 from ccatp.links.bus import BATCH_FRAMES, Publisher, Telemetry, VerdictSubscriber
 from ccatp.links.topics import TrackMessage

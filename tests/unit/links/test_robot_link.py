@@ -16,6 +16,7 @@ from ccatp.links.robot_codec import RobotFrame, encode, join_mac
 from ccatp.links.robot_link import (
     LONGEST_REASON,
     LineWriter,
+    LinkHandler,
     RobotLink,
     RobotLinkError,
     RobotRefused,
@@ -191,7 +192,7 @@ async def test_an_error_in_the_callback_ends_the_session_aloud() -> None:
         def fail(sensors: Sensors, line: bytes) -> None:
             raise RuntimeError("surprise")
 
-        link._on_sensors = fail
+        link._handler = LinkHandler(on_sensors=fail, on_lost=seen.on_lost)
         await link.connect(DEADLINE_S)
         await seen.until(lambda: bool(seen.lost))
         assert "surprise" in seen.lost[0]

@@ -1,0 +1,34 @@
+"""Keeps the list of alarms up to date: what danger finds, and why the mission is held, goes home or waits."""
+
+from collections.abc import Iterable
+
+import zmq
+
+from ccatp.core import Cause, Severity
+from ccatp.daemon.operator.alarms import ActiveCause, AlarmList, active_cause
+from ccatp.links.bus import Subscriber
+from ccatp.links.topics import DangerEvent
+
+
+class AlarmWatch:
+    """Raises and ends the alarms of ``alarms``; receives the findings of danger at its ``endpoint``."""
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, alarms: AlarmList) -> None:
+        self.alarms = alarms
+        # Separate from the verdicts, which are read with the frames, because findings are reported without frames, too.
+        self._events = Subscriber(context, [endpoint], ["danger_event"], is_uncounted=True)
+        self._danger_active: list[ActiveCause] = []
+
+    def update(self, causes: Iterable[Cause], t_s: float) -> None:
+        """Take the causes of the mission at robot time ``t_s``, and the events of danger that have arrived."""
+        own = [active_cause(cause) for cause in causes]
+        while (received := self._events.receive()) is not None:
+            event = received[2]
+            if isinstance(event, DangerEvent):
+                self._danger_active = [ActiveCause(name, cause, Severity(grave)) for name, cause, grave in event.active]
+                self.alarms.update([*own, *self._danger_active], event.t_s)
+        self.alarms.update([*own, *self._danger_active], t_s)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._events.close()
