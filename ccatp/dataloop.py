@@ -34,7 +34,7 @@ from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.fault_proxy import FaultProxy, LinkFaults
 from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile, SurveyTruth
-from ccatp.sim.hardware import SimulatedHardware
+from ccatp.sim.hardware import DriveTrain, SimulatedHardware
 from ccatp.sim.robot import Robot
 from ccatp.sim.simulated_robot import SimulatedRobot
 
@@ -56,10 +56,10 @@ class MotorRobot(OnboardRobot, SimulatedRobot, SurveyTruth):
 
     def __init__(self, cfg: Config, onboard: OnboardConfig, start: DeckPose | None = None) -> None:
         servo, sim = onboard.servo, cfg.sim.robot
+        train = DriveTrain(servo.loop_hz, servo.counts_per_rev)
         hardware = _hardware_class(cfg)(
-            cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), start,
-            loop_hz=servo.loop_hz, counts_per_rev=servo.counts_per_rev,
-        )  # fmt: skip
+            cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), train, start
+        )
         self.world = hardware.world
         super().__init__(onboard, hardware, round(cfg.world.commands_delay_s * sim.frame_hz))
         # The newest line is last; the first one is delivered once the deque is full.
@@ -193,26 +193,31 @@ def survey_stand_in(cfg: Config, options: StandInOptions) -> StandIn:
     return StandIn(robot, faults, (partial(_keep, body, robot),), body.close)
 
 
+class SimOutlets(NamedTuple):
+    """Where a simulated robot reports: endpoints of the true state (requests, rows), and the log."""
+
+    truth_rep: str | None = None
+    truth_pub: str | None = None
+    log: ServerLog | None = None
+
+
 async def serve(
     cfg: MissionConfig,
+    options: StandInOptions,
     *,
     lockstep: bool,
     stop: asyncio.Event,
     listener: socket.socket,
-    truth_rep: str | None = None,
-    truth_pub: str | None = None,
-    log: ServerLog | None = None,
-    faults: FaultPlan | None = None,
-    body_file: Path | None = None,
-    is_resuming: bool = False,
+    outlets: SimOutlets,
 ) -> bool:
     """Run the simulated robot of a configuration until ``stop`` is set; returns whether it fell.
 
-    ``faults`` (survey robot only) may include faults of the link, for which a proxy listens instead of the robot.
-    ``body_file`` keeps the true pose between runs. Raises ``zmq.ZMQError`` if an endpoint cannot be bound.
+    Faults of the link in the plan need a proxy, which listens instead of the robot. Raises ``zmq.ZMQError`` if an
+    endpoint cannot be bound.
     """
     make: Callable[[Any, StandInOptions], StandIn] = kind_of(cfg).stand_in.get()
-    made = make(cfg, StandInOptions(faults, body_file, is_resuming))
+    made = make(cfg, options)
+    faults, log = options.faults, outlets.log
     robot, at_work = made.robot, list[Injector | LinkFaults](made.faults)
     async with AsyncExitStack() as stack:
         stack.callback(made.close)
@@ -222,7 +227,7 @@ async def serve(
             at_work.append(LinkFaults(faults.link, await stack.enter_async_context(proxy)))
             listener = behind
         server = DataLoop(robot, lockstep=lockstep, key=read_key(cfg.robot.key_file), log=log, faults=at_work)
-        truth = GroundTruthPublisher(robot, truth_rep, truth_pub)
+        truth = GroundTruthPublisher(robot, outlets.truth_rep, outlets.truth_pub)
         stack.callback(truth.close)
         server.each_frame += [truth.add, *made.each_frame]
         await server.start(listener)

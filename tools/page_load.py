@@ -29,7 +29,7 @@ from playwright.sync_api import CDPSession, Page, sync_playwright
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.daemon.operator.dashboard import serve_page
-from ccatp.daemon.supervision.process import Endpoints
+from ccatp.daemon.supervision.process import Endpoints, RunContext
 from ccatp.links.bus import Publisher
 from ccatp.links.topics import FixMessage, Heartbeat, TrackMessage, TruthMessage
 from ccatp.report.dashboard.access import make_token
@@ -53,10 +53,8 @@ class Held(NamedTuple):
 
 
 def _serve(cfg: Config, folder: Path, listener: socket.socket) -> None:
-    page = serve_page(
-        cfg, folder, Endpoints(folder), listener, asyncio.Event(), structlog.get_logger(), is_sim=True,
-        has_heartbeat=False,
-    )  # fmt: skip
+    run = RunContext(cfg, folder, Endpoints(folder), is_sim=True)
+    page = serve_page(run, listener, asyncio.Event(), structlog.get_logger(), has_heartbeat=False)
     asyncio.run(page)
 
 

@@ -66,11 +66,19 @@ _GEAR = 297.92 / 75.81
 MOTOR_12V = Motor(volt=12.0, no_load_rad_s=47.1 / _GEAR, stall_nm=0.0981 * _GEAR, friction_nm=0.0105 * _GEAR)
 
 
+class DriveTrain(NamedTuple):
+    """What turns the wheels: frequency of the control loop, encoder and motor. If ``is_lifted``, they turn freely."""
+
+    loop_hz: float
+    counts_per_rev: float
+    motor: Motor = MOTOR_12V
+    is_lifted: bool = False
+
+
 class SimulatedHardware:
     """The devices of a simulated robot; ``read`` advances the world to its time.
 
-    ``rng`` is the parent of the generators; with ``is_lifted`` the wheels turn freely. A test may set ``faults``, which
-    are reported unchanged.
+    ``rng`` is the parent of the generators. A test may set ``faults``, which are reported unchanged.
 
     Attributes:
         world: the truth.
@@ -82,21 +90,18 @@ class SimulatedHardware:
         cfg: Config,
         mirror: Mirror,
         rng: np.random.Generator,
+        train: DriveTrain,
         start: DeckPose | None = None,
-        *,
-        loop_hz: float,
-        counts_per_rev: float,
-        motor: Motor = MOTOR_12V,
-        is_lifted: bool = False,
     ) -> None:
         inertia_kg_m2 = 0.5 * _MASS_KG * cfg.robot.wheel_radius_m**2
-        sim_robot = cfg.sim.robot.model_copy(
-            update={"frame_hz": loop_hz, "wheel_lag_s": motor.time_constant_s(inertia_kg_m2)}
-        )
+        lag_s = train.motor.time_constant_s(inertia_kg_m2)
+        sim_robot = cfg.sim.robot.model_copy(update={"frame_hz": train.loop_hz, "wheel_lag_s": lag_s})
         cfg = cfg.model_copy(update={"sim": cfg.sim.model_copy(update={"robot": sim_robot})})
         world_rng, sensors_rng = rng.spawn(2)
-        self._motor, self._mirror = motor, mirror
-        self._loop_hz, self._per_rad = loop_hz, counts_per_rev / (2.0 * pi)
+        self._mirror = mirror
+        self._motor = train.motor
+        self._loop_hz = train.loop_hz
+        self._per_rad = train.counts_per_rev / (2.0 * pi)
         self.world = self._make_world(cfg, world_rng, start)
         self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=self.world.wheels.lag_s)
         self._sensors.edges.place(self.world.plant)
@@ -105,8 +110,8 @@ class SimulatedHardware:
         self._duty = (floor_duty, floor_duty)
         self.wheel_radius_m = cfg.robot.wheel_radius_m
         self._step = -1
-        self._is_lifted = is_lifted
-        if is_lifted:
+        self._is_lifted = train.is_lifted
+        if train.is_lifted:
             self.world.grip = (0.0, 0.0)
         self.voltages_v = (0.0, 0.0)
         self.faults: dict[str, str] = {}

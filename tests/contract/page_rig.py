@@ -19,7 +19,7 @@ from structlog.typing import FilteringBoundLogger
 
 from ccatp.config.models import Config
 from ccatp.daemon.operator.dashboard import serve_page
-from ccatp.daemon.supervision.process import Endpoints
+from ccatp.daemon.supervision.process import Endpoints, RunContext
 from ccatp.links.bus import Publisher
 from ccatp.links.channels import format_ok
 from ccatp.links.rpc import Router
@@ -168,7 +168,8 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
     log: FilteringBoundLogger = structlog.wrap_logger(None, processors=[capture])
     main, danger = (Publisher(context, endpoints.of(name)) for name in ("main", "danger"))
     rig = Rig(listener.getsockname()[1], make_token(folder), main, danger, stop, capture.entries)
-    page = serve_page(cfg, folder, endpoints, listener, stop, log, is_sim=True, has_heartbeat=True)
+    run = RunContext(cfg, folder, endpoints, is_sim=True)
+    page = serve_page(run, listener, stop, log, has_heartbeat=True)
     try:
         async with asyncio.TaskGroup() as tasks:
             served = tasks.create_task(page)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ccatp import dataloop
 from ccatp.config.models import Config
 from ccatp.daemon.loops import sim_robot
-from ccatp.dataloop import DataLoop, serve, survey_robot
+from ccatp.dataloop import DataLoop, SimOutlets, StandInOptions, serve, survey_robot
 from ccatp.links.robot_messages import Sensors
 from tests.support.daemon import at_work, link_to
 from tests.support.scenario import SurveyLoop, any_port, config_of
@@ -212,7 +212,10 @@ async def test_a_fall_is_reported_to_the_program_that_started_the_robot_and_not_
                 logged.append(fields)
                 stop.set()
 
-    task = asyncio.create_task(serve(config_of(), lockstep=False, stop=stop, listener=listener, log=Log()))
+    serving = serve(
+        config_of(), StandInOptions(), lockstep=False, stop=stop, listener=listener, outlets=SimOutlets(log=Log())
+    )
+    task = asyncio.create_task(serving)
     peer = RobotPeer(*await asyncio.open_connection(*listener.getsockname()))
     peer.writer.write(JOIN)
     await peer.message()

@@ -32,12 +32,12 @@ from ccatp.config.onboard_models import DevicesConfig
 from ccatp.links import realtime
 from ccatp.mirror.mirror import build_mirror
 from ccatp.onboard.devices.daq import SAMPLE, SAMPLES
-from ccatp.onboard.devices.linux import LinuxHardware
+from ccatp.onboard.devices.linux import DeviceAccess, LinuxHardware
 from ccatp.onboard.hardware import Hardware
 from ccatp.onboard.program import serve
 from ccatp.onboard.robot import OnboardRobot
 from ccatp.sim.ground_truth import GroundTruthPublisher, SurveyTruth
-from ccatp.sim.hardware import SimulatedHardware
+from ccatp.sim.hardware import DriveTrain, SimulatedHardware
 from ccatp.sim.world import World
 from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime, voltage_of
 
@@ -125,14 +125,8 @@ class RobotBench:
         self.pwm = FakePwm(folder, monkeypatch, {0: 2, 1: 2})
         self._steps, self._radius_m = 0, simulated.wheel_radius_m
         self._speeds: deque[float] = deque(maxlen=1 + round(devices.daq.sample_hz / devices.bno055.rate_hz))
-        self.hardware = LinuxHardware(
-            devices,
-            self.clock,
-            open_bus=lambda _: self.bno055.open(),
-            open_port=self.daq.open,
-            open_lines=self.bridge.open,
-            pwm_root=folder,
-        )
+        access = DeviceAccess(lambda _: self.bno055.open(), self.daq.open, self.bridge.open, folder)
+        self.hardware = LinuxHardware(devices, self.clock, access)
 
     def step(self) -> tuple[int, int, list[float]]:
         """Move the robot on by one sample: counts, and voltages of the edge sensors."""
@@ -204,10 +198,9 @@ def main() -> int:
     }
     onboard = load_onboard_config(overrides=robot)
     boot_s = time.monotonic()
-    simulated = SimulatedHardware(
-        cfg, mirror, np.random.default_rng(cfg.run.seed), counts_per_rev=onboard.servo.counts_per_rev,
-        loop_hz=onboard.devices.daq.sample_hz if options.fakes else onboard.servo.loop_hz,
-    )  # fmt: skip
+    loop_hz = onboard.devices.daq.sample_hz if options.fakes else onboard.servo.loop_hz
+    train = DriveTrain(loop_hz, onboard.servo.counts_per_rev)
+    simulated = SimulatedHardware(cfg, mirror, np.random.default_rng(cfg.run.seed), train)
     hardware: Hardware = simulated
     if options.fakes:
         folder = Path(tempfile.mkdtemp(prefix="ccatp-pwm-"))

@@ -18,21 +18,20 @@ from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import DeckPose, Fix, PointId, Severity, Vector3, Verdict
-from ccatp.daemon.loops.fix_service import FixRequest, FixService
+from ccatp.daemon.loops.fix_service import FixChecks, FixRequest, FixService
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage
-from ccatp.localizer import Localizer
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.sil_run import SilRun
-from ccatp.survey.composition import Checkpoint, take_over
+from ccatp.survey.composition import Checkpoint, SurveyParts, take_over
 from ccatp.survey.events import Fault, FixFailed, FixStored, MissionState, SurveyInput, TakenOver
 from ccatp.survey.fix_gate import FixGate, nis_of
-from ccatp.survey.statechart import Mission
+from ccatp.survey.laser_follow import LaserFollow
 from tests.support.virtual_time import VirtualLoop
 
 T = TypeVar("T")
@@ -170,16 +169,21 @@ def fix_service(
     async def is_laser_ready() -> bool:
         return next(ready, True)
 
+    etalon = cfg.etalon.model_copy(update={"measuring_time_s": measuring_time_s})
+    parts = SimpleNamespace(
+        cfg=cfg.model_copy(update={"etalon": etalon}),
+        localizer=localizer or sightless(),
+        mission=mission,
+        heading_sigma_rad=float,
+    )
+    follow = SimpleNamespace(begin=lambda: None, doubt=lambda _: "", is_certain=False)
     return FixService(
-        cfg.mission,
         cast(EtalonClient, SimpleNamespace(measure=measure, is_laser_ready=is_laser_ready)),
-        cast(FixGate, gate),
-        cast(Localizer, localizer or sightless()),
-        cast(Mission, mission),
+        FixChecks(gate, cast(LaserFollow, follow)),
+        cast(SurveyParts, parts),
         store,
         cast(Telemetry, SimpleNamespace(send=publish, notify_operator=notify, seq=0)),
-        on_finished,
-        lambda: measuring_time_s,
+        SimpleNamespace(release_time=on_finished, is_lockstep=False),
     )
 
 

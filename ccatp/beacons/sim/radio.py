@@ -129,6 +129,13 @@ class _Reflection(NamedTuple):
     loss_db: float
 
 
+class RadioDraws(NamedTuple):
+    """Generators of the random numbers of a sender: what belongs to places, and what differs in each reading."""
+
+    places: np.random.Generator
+    noise: np.random.Generator
+
+
 class TrueRadio:
     """The radio channel from one sender to the receiver on the vehicle.
 
@@ -139,12 +146,16 @@ class TrueRadio:
 
     def __init__(
         self, reference_dbm: float, cfg: SimRadioConfig, size_m: Point, obstacles: Sequence[SimObstacleConfig],
-        readings: int, places: np.random.Generator, noise: np.random.Generator,
+        readings: int, draws: RadioDraws,
     ) -> None:  # fmt: skip
-        self._reference_dbm, self._cfg, self._obstacles = reference_dbm, cfg, obstacles
-        self._step_rad, self._readings, self._noise = tau / readings, readings, noise
-        self._shadowing = ShadowingField(cfg.shadowing_sigma_db, cfg.shadowing_length_m, places)
-        self._reflections = [_drawn_reflection(size_m, cfg, places) for _ in range(cfg.multipath_paths)]
+        self._reference_dbm = reference_dbm
+        self._cfg = cfg
+        self._obstacles = obstacles
+        self._readings = readings
+        self._step_rad = tau / readings
+        self._noise = draws.noise
+        self._shadowing = ShadowingField(cfg.shadowing_sigma_db, cfg.shadowing_length_m, draws.places)
+        self._reflections = [_drawn_reflection(size_m, cfg, draws.places) for _ in range(cfg.multipath_paths)]
 
     def rays(self, pose: TruePose, sender_m: Point) -> list[Ray]:
         """All rays from a sender to the vehicle, the direct one first."""

@@ -20,6 +20,7 @@ from ccatp.beacons.config.models import (
 from ccatp.beacons.links.messages import BeaconFrame, RadioSample, RadioScan
 from ccatp.beacons.sim.radio import (
     MovingTarget,
+    RadioDraws,
     SimDriveCommand,
     TruePose,
     TrueRadio,
@@ -104,7 +105,7 @@ class RadioWorld:
         self._radios = {
             name: TrueRadio(
                 reference_dbm, cfg.sim.radio, cfg.workspace.size_m, self.obstacles, cfg.scan.readings,
-                _stream(seed, _PLACES, index), _stream(seed, _NOISE, index),
+                RadioDraws(_stream(seed, _PLACES, index), _stream(seed, _NOISE, index)),
             )
             for index, (name, reference_dbm) in enumerate(references.items())
         }  # fmt: skip

@@ -30,7 +30,7 @@ from ccatp.beacons.links.messages import RadioScan
 from ccatp.beacons.navigation import BeaconMeasurements, RadioNavigator, odometry_of, packets_of
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.rigid_motion import best_motion, rms_m
-from ccatp.beacons.sim.radio import SimDriveCommand, TruePose, TrueRadio
+from ccatp.beacons.sim.radio import RadioDraws, SimDriveCommand, TruePose, TrueRadio
 from ccatp.beacons.sim.radio_world import RadioWorld
 from ccatp.beacons.steering import HALT
 from ccatp.beacons.studies.radio_bound import RadioBound, TrueStep, radio_bound
@@ -342,10 +342,9 @@ def draw_signals(results: Sequence[CellResult], out: Path) -> None:
 
 
 def _turns(cfg: RadioConfig, sender_m: tuple[float, float]) -> list[Reading]:
-    places, noise = (np.random.default_rng([cfg.run.seed, stream]) for stream in (0, 1))
-    radio = TrueRadio(
-        cfg.path_loss.reference_dbm, cfg.sim.radio, cfg.workspace.size_m, (), cfg.scan.readings, places, noise
-    )
+    draws = RadioDraws(*(np.random.default_rng([cfg.run.seed, stream]) for stream in (0, 1)))
+    size_m = cfg.workspace.size_m
+    radio = TrueRadio(cfg.path_loss.reference_dbm, cfg.sim.radio, size_m, (), cfg.scan.readings, draws)
     scan = ReflectorScan(cfg.scan)
     headings = np.random.default_rng([cfg.run.seed, 2]).uniform(-pi, pi, TURNS) / cfg.scan.readings
     found = []

@@ -1,11 +1,10 @@
 """Takes one measurement at a time: laser system, fix gate, localizer, store, mission."""
 
 import asyncio
-from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from math import inf
-from typing import Any
+from typing import Any, Protocol
 
 from ccatp.conditions import (
     DISK_STALLS,
@@ -16,18 +15,16 @@ from ccatp.conditions import (
     SKIP_NOT_STORED,
     text_of,
 )
-from ccatp.config.models import MissionConfig
 from ccatp.core import NO_CAUSE, UNRELIABLE, Cause, DeckPose, Fix, PointId, Vector3
 from ccatp.estimation.fixes import FixRefused
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry
 from ccatp.links.topics import FixMessage
-from ccatp.localizer import Localizer
 from ccatp.records.store import AlreadyMeasuredError, MissionStore, StoreError
+from ccatp.survey.composition import SurveyParts
 from ccatp.survey.events import Fault, FixFailed, FixStored, PointMissed
 from ccatp.survey.fix_gate import ApproachCounter, FixGate
 from ccatp.survey.laser_follow import LaserFollow
-from ccatp.survey.statechart import Mission
 
 # A commit takes milliseconds, or a second on a busy disk. After these times it is reported, then holds the robot.
 SLOW_DISK_S = 2.0
@@ -57,35 +54,54 @@ class FixRequest:
     estimate: DeckPose
 
 
-class FixService:
-    """Takes the measurements that the mission requests; a point counts only when its fix is committed.
+@dataclass(frozen=True, slots=True)
+class FixChecks:
+    """What judges a fix before it is fused: by the estimate, and by the robot's motion since the one before."""
 
-    ``on_finished``: called after each measurement, successful or not. ``between_s``: wait for new lengths before
-    measuring again at the same place. ``heading_sigma_of``: returns the standard deviation of the heading, rad.
-    """
+    gate: FixGate
+    follow: LaserFollow
+
+
+class FixHost(Protocol):
+    """What the service needs of the main loop."""
+
+    @property
+    def is_lockstep(self) -> bool:
+        """Simulated time stands still during a measurement."""
+
+    def release_time(self) -> None:
+        """A measurement is over, successful or not."""
+
+
+class FixService:
+    """Takes the measurements that the mission requests; a point counts only when its fix is committed."""
 
     def __init__(
         self,
-        cfg: MissionConfig,
         client: EtalonClient,
-        fix_gate: FixGate,
-        localizer: Localizer,
-        mission: Mission,
+        checks: FixChecks,
+        parts: SurveyParts,
         store: MissionStore,
         telemetry: Telemetry,
-        on_finished: Callable[[], None],
-        between_s: Callable[[], float],
-        heading_sigma_of: Callable[[], float] = float,
-        follow: LaserFollow | None = None,
-        alarm_points: int = 3,
+        host: FixHost,
     ) -> None:
-        self._follow, self._alarm_points, self._unreliable = follow, alarm_points, 0
-        self._tolerance_m = cfg.arrival_tolerance_m
-        self._approaches = ApproachCounter(cfg.correction_tolerance_m, cfg.max_approaches)
-        self._client, self._localizer, self._mission = client, localizer, mission
-        self._store, self._telemetry, self._on_finished, self._between_s = store, telemetry, on_finished, between_s
-        self._fix_gate, self._notify, self._heading_sigma_of = fix_gate, telemetry.notify_operator, heading_sigma_of
-        self._timeout_s = cfg.measure_timeout_s
+        mission, etalon = parts.cfg.mission, parts.cfg.etalon
+        self._client = client
+        self._fix_gate = checks.gate
+        self._follow = checks.follow
+        self._localizer = parts.localizer
+        self._mission = parts.mission
+        self._heading_sigma_of = parts.heading_sigma_rad
+        self._store = store
+        self._telemetry = telemetry
+        self._notify = telemetry.notify_operator
+        self._host = host
+        self._tolerance_m = mission.arrival_tolerance_m
+        self._approaches = ApproachCounter(mission.correction_tolerance_m, mission.max_approaches)
+        self._timeout_s = mission.measure_timeout_s
+        self._measuring_time_s = etalon.measuring_time_s
+        self._alarm_points = etalon.alarm_points
+        self._unreliable = 0
         self._wanted: FixRequest | None = None
         self._wakes = asyncio.Event()
         self.is_busy = False  # from ``begin`` to the end of the measurement
@@ -109,7 +125,7 @@ class FixService:
                 await self._serve(request)
             if self._wanted is None:
                 self.is_busy = False
-                self._on_finished()
+                self._host.release_time()
 
     def _is_wanted(self, request: FixRequest) -> bool:
         """Whether the mission still waits for it; not after a pause or an edge, because the robot may have moved."""
@@ -119,15 +135,15 @@ class FixService:
     async def _serve(self, request: FixRequest) -> None:
         """Measure, and repeat a doubtful fix, within the time limit of a point."""
         self._fix_gate.begin()
-        if self._follow is not None:
-            self._follow.begin()
+        self._follow.begin()
         try:
             await self._await_laser(request)
             async with asyncio.timeout(self._timeout_s):
                 fix, doubt = await self._measure(request)
                 for _ in range(REPEATS):
                     if doubt and self._is_wanted(request):
-                        await asyncio.sleep(self._between_s())
+                        # New lengths take a measuring time; in lockstep simulated time stands still meanwhile.
+                        await asyncio.sleep(0.0 if self._host.is_lockstep else self._measuring_time_s)
                         fix, doubt = await self._measure(request)
         except (EtalonError, TimeoutError) as error:
             await self._fail(request, str(error) or f"no fix within {self._timeout_s:g} s", error)
@@ -165,7 +181,7 @@ class FixService:
         finding = self._fix_gate.review(
             fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.state.is_lost
         )
-        stuck = "" if self._follow is None else self._follow.doubt(fix)
+        stuck = self._follow.doubt(fix)
         doubt, jump_m = finding.doubt or text_of(finding.refusal) or stuck, 0.0
         is_set_aside = bool(doubt)
         if not is_set_aside:
@@ -184,7 +200,7 @@ class FixService:
         self._telemetry.send("fix", message)
         if finding.refusal:
             raise LaserUnusable(finding.refusal)
-        if stuck and self._follow is not None and self._follow.is_certain:
+        if stuck and self._follow.is_certain:
             raise LaserUnusable(LASER_NOT_FOLLOWING.because(count=self._follow.standstills))
         if doubt:
             self._notify("info", f"the fix at {_name(request.point)} is not used: {doubt}")
@@ -256,7 +272,7 @@ class FixService:
                 await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
             if not waiting.done():
                 self._mission.handle(Fault(DISK_STALLS.because(point=_name(point), time_s=STALLED_DISK_S)))
-                self._on_finished()
+                self._host.release_time()
             await waiting
         finally:
             waiting.cancel()

@@ -11,7 +11,7 @@ import structlog
 from ccatp.config.mission import MissionConfig
 from ccatp.daemon.supervision.child_processes import listen
 from ccatp.daemon.supervision.process import FAULTS_FILE, Endpoints, open_log, run_until_stopped, start_process
-from ccatp.dataloop import serve
+from ccatp.dataloop import SimOutlets, StandInOptions, serve
 from ccatp.errors import ExitStatus
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.missions import kind_of
@@ -24,20 +24,13 @@ def main() -> int:
     args = start_process()
     cfg, lockstep = args.config, not args.is_realtime
     plan = read_plan(args.run_dir / FAULTS_FILE, lockstep=lockstep) if args.has_faults else None
+    options = StandInOptions(plan, args.run_dir / ROBOT_FILE, args.is_resuming)
 
     async def run(stop: asyncio.Event) -> int:
-        await serve(
-            cfg,
-            lockstep=lockstep,
-            stop=stop,
-            listener=socket.socket(fileno=args.listen_fd),
-            truth_rep=args.endpoints.of("puck"),
-            truth_pub=args.endpoints.of("truth"),
-            log=open_log(args.run_dir / "log.jsonl", "dataloop"),
-            faults=plan,
-            body_file=args.run_dir / ROBOT_FILE,
-            is_resuming=args.is_resuming,
-        )
+        listener = socket.socket(fileno=args.listen_fd)
+        log = open_log(args.run_dir / "log.jsonl", "dataloop")
+        outlets = SimOutlets(args.endpoints.of("puck"), args.endpoints.of("truth"), log)
+        await serve(cfg, options, lockstep=lockstep, stop=stop, listener=listener, outlets=outlets)
         return 0
 
     return run_until_stopped(run)
@@ -60,9 +53,8 @@ def run_alone(
     with locked(folder / TRUTH_LOCK_FILE, refusal), listen("sim.robot", at.host, at.port) as listener:
 
         async def run(stop: asyncio.Event) -> int:
-            has_fallen = await serve(
-                cfg, lockstep=lockstep, stop=stop, listener=listener, truth_rep=truth, log=log, faults=faults
-            )
+            options, outlets = StandInOptions(faults), SimOutlets(truth_rep=truth, log=log)
+            has_fallen = await serve(cfg, options, lockstep=lockstep, stop=stop, listener=listener, outlets=outlets)
             if has_fallen:
                 print("ccatp: the simulated robot fell; robot_fell above says why, when and where", file=sys.stderr)
             return ExitStatus.HELD if has_fallen else ExitStatus.COMPLETE

@@ -10,7 +10,7 @@ from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
 from ccatp.core import NO_CAUSE, Cause, Verdict
 from ccatp.daemon.loops.checkpoints import build_parts
-from ccatp.daemon.loops.fix_service import FixRequest, FixService
+from ccatp.daemon.loops.fix_service import FixChecks, FixRequest, FixService
 from ccatp.daemon.loops.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionHost, MissionRunner, TimedFrame
 from ccatp.daemon.loops.survey_pipeline import SurveyPipeline
 from ccatp.daemon.supervision.process import ProcessArgs
@@ -142,21 +142,8 @@ class SurveyRunner(MissionRunner):
         self._fans_seq = 0
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._follow = LaserFollow(cfg)
-        self._fix_service = FixService(
-            cfg.mission,
-            self._etalon,
-            FixGate(parts.mirror, cfg),
-            parts.localizer,
-            self.mission,
-            store,
-            self.telemetry,
-            host.release_time,
-            # no wait in lockstep, whose time stands still meanwhile
-            lambda: 0.0 if host.is_lockstep else cfg.etalon.measuring_time_s,
-            parts.heading_sigma_rad,
-            self._follow,
-            cfg.etalon.alarm_points,
-        )
+        checks = FixChecks(FixGate(parts.mirror, cfg), self._follow)
+        self._fix_service = FixService(self._etalon, checks, parts, store, self.telemetry, host)
         self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)

@@ -17,10 +17,16 @@ import structlog
 import zmq
 
 from ccatp.config.load import load_mission
-from ccatp.config.mission import MissionConfig
 from ccatp.daemon.operator.observatory import LOGGED_LINES, LOGGED_PERIOD_S
 from ccatp.daemon.supervision.child_processes import open_page_socket, token_query
-from ccatp.daemon.supervision.process import Endpoints, open_log, run_dir_in, run_until_stopped, start_process
+from ccatp.daemon.supervision.process import (
+    Endpoints,
+    RunContext,
+    open_log,
+    run_dir_in,
+    run_until_stopped,
+    start_process,
+)
 from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.bus import HeartbeatPublisher, Publisher
 from ccatp.links.liveness import LogRateLimit
@@ -39,21 +45,14 @@ ROOT = "dashboard."
 
 
 async def serve_page(
-    cfg: MissionConfig,
-    run_dir: Path,
-    endpoints: Endpoints,
-    listener: socket.socket,
-    stop: asyncio.Event,
-    log: Logger,
-    *,
-    is_sim: bool,
-    has_heartbeat: bool,
+    run: RunContext, listener: socket.socket, stop: asyncio.Event, log: Logger, *, has_heartbeat: bool
 ) -> None:
     """Serve a dashboard until ``stop`` is set and the open pages have received the last state.
 
-    The past of the run is read from ``run_dir``: points from the database, path and plots from the recording.
+    The past of the run is read from its directory: points from the database, path and plots from the recording.
     ConfigError: the tokens cannot be read.
     """
+    cfg, run_dir, endpoints, is_sim = run.config, run.run_dir, run.endpoints, run.is_sim
     settings, is_over = cfg.dashboard, asyncio.Event()
     tokens = page_tokens(settings, endpoints.runtime_dir)
     kind = kind_of(cfg)
@@ -133,8 +132,7 @@ def main() -> int:
     """Entry of ``python -m ccatp.daemon.operator.dashboard``."""
     args = start_process()
     listener = socket.socket(fileno=args.listen_fd)
-    places = args.run_dir, args.endpoints, listener
-    return _run(args.run_dir, partial(serve_page, args.config, *places, is_sim=args.is_sim, has_heartbeat=True))
+    return _run(args.run_dir, partial(serve_page, args.run, listener, has_heartbeat=True))
 
 
 def attach(runtime_dir: Path | None, settings: Mapping[str, object], report: Callable[[str], None]) -> int:
@@ -159,8 +157,8 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], report: Cal
     is_sim = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
     with page.socket:
         report(page.text + token_query(cfg.dashboard, folder))
-        places = run_dir, Endpoints(folder), page.socket
-        return _run(run_dir, partial(serve_page, cfg, *places, is_sim=is_sim, has_heartbeat=False))
+        context = RunContext(cfg, run_dir, Endpoints(folder), is_sim)
+        return _run(run_dir, partial(serve_page, context, page.socket, has_heartbeat=False))
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from ccatp.conditions import danger_text, find_condition
-from ccatp.config.mission import MissionConfig
 from ccatp.core import Severity
+from ccatp.daemon.supervision.process import RunContext
 from ccatp.daemon.supervision.run_text import RunText, clock
 from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
@@ -54,9 +54,12 @@ class RunView:
     ``verbosity``: -1 shows only warnings and errors; 1 adds each change of the state.
     """
 
-    def __init__(self, cfg: MissionConfig, *, is_sim: bool, run_dir: Path, verbosity: int = 0) -> None:
-        self._is_quiet, self._is_verbose, self._state = verbosity < 0, verbosity > 0, ""
-        self._text: RunText = kind_of(cfg).text.get()(cfg)
+    def __init__(self, run: RunContext, verbosity: int = 0) -> None:
+        is_sim = run.is_sim
+        self._is_quiet = verbosity < 0
+        self._is_verbose = verbosity > 0
+        self._state = ""
+        self._text: RunText = kind_of(run.config).text.get()(run.config)
         self._console: Console = _BufferedConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal and not self._is_quiet
         self._rate_limit = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
@@ -65,7 +68,7 @@ class RunView:
         self._shown_tenths = 0
         title, self._goals = self._text.title(is_sim), self._text.goals
         if not self._is_quiet:
-            self._console.print(printable(f"{title}; writing {run_dir}"), soft_wrap=True, markup=False)
+            self._console.print(printable(f"{title}; writing {run.run_dir}"), soft_wrap=True, markup=False)
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),

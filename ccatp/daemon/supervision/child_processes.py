@@ -63,6 +63,15 @@ class ProcessEnd(Enum):
     WITHOUT = "without"  # the run continues without the process
 
 
+class ChildDeath(NamedTuple):
+    """A dead process: exit status, or minus the signal; the consequence for the run; a line for the operator."""
+
+    name: str
+    code: int
+    end: ProcessEnd
+    text: str
+
+
 class RestartPolicy:
     """Decides on restarts in one run; each process may be restarted ``limit`` times within ``window_s``."""
 
@@ -70,11 +79,11 @@ class RestartPolicy:
         self._limit, self._window_s = limit, window_s
         self._restarts_s: defaultdict[str, deque[float]] = defaultdict(deque)
 
-    def died(self, spec: ProcessSpec, code: int, now_s: float, why: str = "") -> tuple[ProcessEnd, str]:
-        """Decide after the death of a process; ``code``: exit status, or minus the number of the killing signal.
+    def died(self, spec: ProcessSpec, code: int, now_s: float, why: str = "") -> ChildDeath:
+        """Decide after the death of a process; ``code``: exit status, or minus the number of the killing signal."""
+        return ChildDeath(spec.name, code, *self._consequence(spec, code, now_s, why))
 
-        Returns the consequence for the run, and a line for the operator.
-        """
+    def _consequence(self, spec: ProcessSpec, code: int, now_s: float, why: str) -> tuple[ProcessEnd, str]:
         how = f"was killed by {_SIGNALS.get(-code, f'signal {-code}')}" if code < 0 else f"ended with status {code}"
         what = f"process {spec.name} {why or how}"
         is_final = code in FINAL
@@ -175,11 +184,8 @@ class ProcessManager:
         if child is not None and child.watch is not None and child.process.pid == heartbeat.pid:
             child.watch.reset()
 
-    def poll(self, now_s: float) -> tuple[str, int, ProcessEnd, str] | None:
-        """Collect dead processes, kill hung ones, and restart.
-
-        Returns the process that ends the run, its exit code, the consequence, and a line for the operator; or ``None``.
-        """
+    def poll(self, now_s: float) -> ChildDeath | None:
+        """Collect dead processes, kill hung ones, and restart; returns the death that ends the run, or ``None``."""
         for name, child in tuple(self._children.items()):
             spec, code = child.spec, child.process.poll()
             if code is None:
@@ -187,11 +193,11 @@ class ProcessManager:
                     child.why_killed = child.watch.text
                     child.process.kill()  # also ends a stopped process; the next poll finds it dead
                 continue
-            end, text = self._policy.died(spec, code, now_s, child.why_killed)
-            if end in (ProcessEnd.END, ProcessEnd.HELD):
-                return name, code, end, text
-            self._notify_operator("warning", text)
-            if end is ProcessEnd.WITHOUT:
+            death = self._policy.died(spec, code, now_s, child.why_killed)
+            if death.end in (ProcessEnd.END, ProcessEnd.HELD):
+                return death
+            self._notify_operator("warning", death.text)
+            if death.end is ProcessEnd.WITHOUT:
                 del self._children[name]
                 continue
             self.restarts += 1

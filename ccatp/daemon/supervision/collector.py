@@ -3,16 +3,15 @@
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import msgspec
 import zmq
 
 import ccatp
 from ccatp.config.load import dump_config
-from ccatp.config.mission import MissionConfig
 from ccatp.daemon.operator.terminal import RunView
-from ccatp.daemon.supervision.process import Endpoints
+from ccatp.daemon.supervision.process import RunContext
 from ccatp.daemon.supervision.run_text import RunText
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Subscriber
@@ -26,9 +25,6 @@ from ccatp.records.recorder import (
 )
 from ccatp.records.run_record import RunRecord
 from ccatp.report.foxglove import recorded_schemas
-
-if TYPE_CHECKING:
-    pass
 
 _UNRECORDED = (Timing, Heartbeat)  # received, too
 FINISH_TIMEOUT_S = 5.0
@@ -44,22 +40,22 @@ class Collector:
     def __init__(
         self,
         context: zmq.Context[zmq.Socket[bytes]],
-        endpoints: Endpoints,
-        run_dir: Path,
-        cfg: MissionConfig,
+        run: RunContext,
         on_heartbeat: Callable[[Heartbeat], None],
-        *,
-        is_sim: bool,
     ) -> None:
         """Subscribe before the first message is published."""
-        self._context, self._endpoints, self._on_heartbeat, self._is_sim = context, endpoints, on_heartbeat, is_sim
+        self._context = context
+        self._run = run
+        self._on_heartbeat = on_heartbeat
+        cfg, run_dir, is_sim, endpoints = run.config, run.run_dir, run.is_sim, run.endpoints
         names = ("main", "danger", "dashboard", *(("truth",) if is_sim else ()))
         received = [topic.name for topic in topics_of(kind_of(cfg)) if topic.recorded or topic.message in _UNRECORDED]
         self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], received)
         clock = RobotClock(is_simulation=is_sim)
         kind = kind_of(cfg)
         make: Callable[[Any, Path, RobotClock, bool], RunRecord] = kind.record.get()
-        self._record, self._has_views = make(cfg, run_dir, clock, is_sim), True
+        self._record = make(cfg, run_dir, clock, is_sim)
+        self._has_views = True
         self._view: RunView | None = None
         text: RunText = kind.text.get()(cfg)
         what = {kind.subject: text.subject, "seed": str(cfg.run.seed), **text.details}
@@ -83,7 +79,7 @@ class Collector:
 
     def finish(self) -> None:
         """Request the last rows of the simulated truth, and wait for the messages that are still on their way."""
-        if self._is_sim:
+        if self._run.is_sim:
             rows = int(self._request(b"flush").get("rows", 0))
             self._record.ask_truth(self._request)
             for _ in range(int(FINISH_TIMEOUT_S * 100)):
@@ -158,7 +154,7 @@ class Collector:
         """Reply of the simulated truth; empty if it has ended, when all its messages have arrived."""
         with self._context.socket(zmq.REQ) as peer:
             peer.setsockopt(zmq.LINGER, 0)
-            peer.connect(self._endpoints.of("puck"))
+            peer.connect(self._run.endpoints.of("puck"))
             peer.send(request)
             if not peer.poll(int(REQUEST_TIMEOUT_S * 1000)):
                 return {}

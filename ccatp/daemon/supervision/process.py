@@ -72,6 +72,17 @@ def run_dir_in(runtime_dir: Path) -> Path | None:
 
 
 @dataclass(frozen=True, slots=True)
+class RunContext:
+    """What belongs to one run, for everything that works on it."""
+
+    config: MissionConfig
+    run_dir: Path
+    endpoints: Endpoints
+    is_sim: bool  # robot and laser system are simulated
+    locks: tuple[int, ...] = ()  # descriptors that every child inherits
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessArgs:
     """Arguments of a process."""
 
@@ -85,6 +96,11 @@ class ProcessArgs:
     is_restarted: bool = False  # replaces a process of this run that died; in a resumed run, after its first frame
     is_held: bool = False
     is_sim: bool = False  # robot and laser system are simulated
+
+    @property
+    def run(self) -> RunContext:
+        """The run of the process."""
+        return RunContext(self.config, self.run_dir, self.endpoints, self.is_sim)
 
     @property
     def is_taking_over(self) -> bool:

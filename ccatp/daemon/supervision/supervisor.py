@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -35,7 +34,14 @@ from ccatp.daemon.supervision.child_processes import (
 )
 from ccatp.daemon.supervision.collector import Collector
 from ccatp.daemon.supervision.named_files import check_named_files
-from ccatp.daemon.supervision.process import ADDRESSES_FILE, FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
+from ccatp.daemon.supervision.process import (
+    ADDRESSES_FILE,
+    FAULTS_FILE,
+    RUN_DIR_FILE,
+    Endpoints,
+    RunContext,
+    open_log,
+)
 from ccatp.daemon.supervision.run_dir import (
     RunOptions,
     await_predecessors,
@@ -142,33 +148,36 @@ def _status_text(status: MissionStatus | None) -> str:
 class SupervisedRun:
     """The children of one run and the messages collected from them.
 
-    ``sockets``: listening sockets of simulators and dashboard, by process name. ``locks``: descriptors that every child
-    inherits. ``started_s``: start of the run by the monotonic clock.
+    ``sockets``: listening sockets of simulators and dashboard, by process name. ``started_s``: start of the run by the
+    monotonic clock.
     """
 
     def __init__(
         self,
         options: RunOptions,
-        cfg: MissionConfig,
-        run_dir: Path,
-        endpoints: Endpoints,
+        run: RunContext,
         sockets: Mapping[str, socket.socket],
-        locks: tuple[int, ...],
         page: PageSocket,
         started_s: float,
     ) -> None:
-        self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
-        self._sockets, self._locks, self._page, self._started_s = sockets, locks, page, started_s
+        self._options = options
+        self._context = run
+        self._cfg = cfg = run.config
+        self._run_dir = run_dir = run.run_dir
+        self._sockets = sockets
+        self._page = page
+        self._started_s = started_s
         self._children = ProcessManager(cfg.processes, self._command_of, self._notify_operator)
-        self._is_interrupted = self._has_begun = False
+        self._is_interrupted = False
+        self._has_begun = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
         self._webhook = AlarmWebhook(cfg.alarms, run_dir.name, self._log, AlarmList(run_dir, self._log).alarms)
-        self._view = RunView(cfg, is_sim=options.sim, run_dir=run_dir, verbosity=options.verbosity)
+        self._view = RunView(run, options.verbosity)
 
     def run(self) -> int:
         """Start, watch, collect, stop; returns the exit status."""
-        cfg, is_sim, view = self._cfg, self._options.sim, self._view
+        cfg, is_sim, view = self._cfg, self._context.is_sim, self._view
         kind = kind_of(cfg)
         text: RunText = kind.text.get()(cfg)
         self._log.info("run_started", **{kind.subject: text.subject}, seed=cfg.run.seed, sim=is_sim)
@@ -178,7 +187,7 @@ class SupervisedRun:
         # A flag instead of an exception, so that no exception handler loses a signal, and no signal ends the shutdown.
         previous = {n: signal.signal(n, self._interrupt) for n in STOP_SIGNALS}
         try:
-            collector = Collector(context, self._endpoints, self._run_dir, cfg, self._on_heartbeat, is_sim=is_sim)
+            collector = Collector(context, self._context, self._on_heartbeat)
             with collector, view:
                 status = self._watch(collector)
                 self._webhook.update(collector.status)
@@ -220,7 +229,7 @@ class SupervisedRun:
         if self._page.text:
             self._log.log(LEVELS[self._page.level], OPERATOR_MESSAGE, text=self._page.text)
             has_token = self._page.socket is not None and not is_journal(STDERR, os.environ)
-            token = token_query(self._cfg.dashboard, self._endpoints.runtime_dir) if has_token else ""
+            token = token_query(self._cfg.dashboard, self._context.endpoints.runtime_dir) if has_token else ""
             self._view.show_message(self._page.level, self._page.text + token)
         for process in process_table(self._cfg):
             # A process that listens runs only if it has a socket.
@@ -240,12 +249,11 @@ class SupervisedRun:
             self._service.update(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
             # A dead process is handled first, because the messages of the others are its consequence.
             if (death := self._children.poll(now_s)) is not None:
-                name, code, end, text = death
-                self._log.error("process_died", name=name, code=code)
-                if end is ProcessEnd.END:
+                self._log.error("process_died", name=death.name, code=death.code)
+                if death.end is ProcessEnd.END:
                     # The process has reported why. After a restart the robot may be anywhere, so the status is held.
-                    return ExitStatus.HELD if self._children.restarts else ExitStatus(code)
-                self._notify_operator("error", f"{text}; see {self._run_dir / 'log.jsonl'}")
+                    return ExitStatus.HELD if self._children.restarts else ExitStatus(death.code)
+                self._notify_operator("error", f"{death.text}; see {self._run_dir / 'log.jsonl'}")
                 return ExitStatus.HELD
             if collector.is_over:
                 return collector.exit_status
@@ -262,20 +270,20 @@ class SupervisedRun:
 
     def _command_of(self, process: ProcessSpec, is_restarted: bool) -> tuple[list[str], tuple[int, ...]]:
         options = self._options
-        arguments = ["--run-dir", str(self._run_dir), "--runtime-dir", str(self._endpoints.runtime_dir)]
+        arguments = ["--run-dir", str(self._run_dir), "--runtime-dir", str(self._context.endpoints.runtime_dir)]
         flags = {
             "--realtime": options.is_paced,
             "--resume": options.resume,
             "--restarted": is_restarted and (self._has_begun or not options.resume),
             "--held": options.held and not self._has_begun,
-            "--sim": options.sim,
+            "--sim": self._context.is_sim,
             "--faults": process.is_simulator and options.faults_file is not None,
         }
         arguments += [flag for flag, is_given in flags.items() if is_given]
         if process.name not in self._sockets:
-            return arguments, self._locks
+            return arguments, self._context.locks
         fd = self._sockets[process.name].fileno()
-        return [*arguments, "--listen-fd", str(fd)], (fd, *self._locks)
+        return [*arguments, "--listen-fd", str(fd)], (fd, *self._context.locks)
 
 
 def run(options: RunOptions) -> int:
@@ -338,7 +346,8 @@ def _run(options: RunOptions, cfg: MissionConfig) -> int:
         (runtime_dir / ADDRESSES_FILE).write_text(json.dumps(_addresses(cfg)) + "\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_text(read_toml(options.faults_file), encoding="utf-8")
-        return SupervisedRun(options, cfg, run_dir, Endpoints(runtime_dir), sockets, locks, page, started_s).run()
+        context = RunContext(cfg, run_dir, Endpoints(runtime_dir), is_sim=options.sim, locks=locks)
+        return SupervisedRun(options, context, sockets, page, started_s).run()
 
 
 def permit_open_files() -> None:

@@ -8,6 +8,7 @@ import importlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import pstdev
@@ -107,27 +108,31 @@ class GpioLines:
         self._request.release()
 
 
+@dataclass(frozen=True, slots=True)
+class DeviceAccess:
+    """How the devices are reached, and what waits for them; tests replace it."""
+
+    open_bus: Callable[[int], Bus] = I2cBus
+    open_port: OpenPort = open_serial
+    open_lines: OpenLines = GpioLines
+    pwm_root: Path = PWM_ROOT
+    imu: type[Bno055] = Bno055
+    sleep: Callable[[float], object] = time.sleep
+
+
 class LinuxHardware:
     """The devices of the configuration; a ``Hardware``. ``clock`` is the robot's clock, as ``now_s`` of ``read``."""
 
-    def __init__(
-        self,
-        config: DevicesConfig,
-        clock: Callable[[], float],
-        *,
-        open_bus: Callable[[int], Bus] = I2cBus,
-        open_port: OpenPort = open_serial,
-        open_lines: OpenLines = GpioLines,
-        pwm_root: Path = PWM_ROOT,
-        imu: type[Bno055] = Bno055,
-        sleep: Callable[[float], object] = time.sleep,
-    ) -> None:
-        self._config, self._clock, self._sleep = config, clock, sleep
-        self._motors = Motors(config.motors, pwm_root, open_lines, sleep)
-        self._timer = ExternalTimer(config.timer, open_lines)
-        self._fans = FanOutputs(config.fans, pwm_root, sleep)
-        self._imu = imu(config.bno055, partial(open_bus, config.bno055.bus), clock, sleep)
-        self._daq = Daq(config.daq, open_port, clock, sleep)
+    def __init__(self, config: DevicesConfig, clock: Callable[[], float], access: DeviceAccess | None = None) -> None:
+        access = access or DeviceAccess()
+        self._config = config
+        self._clock = clock
+        self._sleep = sleep = access.sleep
+        self._motors = Motors(config.motors, access.pwm_root, access.open_lines, sleep)
+        self._timer = ExternalTimer(config.timer, access.open_lines)
+        self._fans = FanOutputs(config.fans, access.pwm_root, sleep)
+        self._imu = access.imu(config.bno055, partial(access.open_bus, config.bno055.bus), clock, sleep)
+        self._daq = Daq(config.daq, access.open_port, clock, sleep)
         # Keys: sections of the configuration. Order of opening: the motors brake first; the devices that then send
         # samples, which are not read before all are open, come last.
         self._devices: dict[str, Motors | ExternalTimer | FanOutputs | Bno055 | Daq] = {

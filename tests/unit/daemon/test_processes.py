@@ -17,6 +17,7 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.daemon.supervision.child_processes import (
+    ChildDeath,
     ProcessEnd,
     ProcessManager,
     ProcessSpec,
@@ -26,7 +27,7 @@ from ccatp.daemon.supervision.child_processes import (
     page_url,
 )
 from ccatp.daemon.supervision.collector import Collector
-from ccatp.daemon.supervision.process import Endpoints, parse_args, unless_stopped
+from ccatp.daemon.supervision.process import Endpoints, RunContext, parse_args, unless_stopped
 from ccatp.daemon.supervision.survey_record import SurveyRecord
 from ccatp.errors import DaemonUnreachableError
 from ccatp.links.bus import HeartbeatPublisher, Publisher
@@ -190,7 +191,7 @@ def test_a_collector_takes_so_many_messages_at_a_time(tmp_path: Path, config: Co
     with (
         zmq.Context() as context,
         closing(Publisher(context, endpoints.of("main"))) as publisher,
-        Collector(context, endpoints, tmp_path, config, received.append, is_sim=False) as collector,
+        Collector(context, RunContext(config, tmp_path, endpoints, is_sim=False), received.append) as collector,
     ):
         while not publisher.has_subscriber("heartbeat.main"):
             time.sleep(0.01)
@@ -223,14 +224,14 @@ def test_a_summary_counts_the_points_of_the_database_where_the_last_status_was_l
 @pytest.mark.fault("P18")
 def test_a_crash_loop_ends_and_rare_deaths_do_not() -> None:
     policy = RestartPolicy(3, 60.0)
-    assert [policy.died(MAIN, -9, t)[0] for t in (0.0, 1.0, 2.0)] == [RESTART] * 3
+    assert [policy.died(MAIN, -9, t).end for t in (0.0, 1.0, 2.0)] == [RESTART] * 3
     line = "process main was killed by SIGKILL, more than 3 times within 60 s: run ended, wheels held"
-    assert policy.died(MAIN, -9, 59.0) == (HELD, line)
-    assert policy.died(replace(MAIN, name="danger"), 1, 59.0)[0] is RESTART  # each counts for itself
+    assert policy.died(MAIN, -9, 59.0) == ChildDeath("main", -9, HELD, line)
+    assert policy.died(replace(MAIN, name="danger"), 1, 59.0).end is RESTART  # each counts for itself
     seldom = RestartPolicy(3, 60.0)
-    assert {seldom.died(MAIN, -9, 21.0 * k)[0] for k in range(50)} == {RESTART}
+    assert {seldom.died(MAIN, -9, 21.0 * k).end for k in range(50)} == {RESTART}
     once = RestartPolicy(1, 60.0)
-    assert [once.died(PAGE, -9, t_s)[0] for t_s in (0.0, 1.0)] == [RESTART, WITHOUT]
+    assert [once.died(PAGE, -9, t_s).end for t_s in (0.0, 1.0)] == [RESTART, WITHOUT]
 
 
 @pytest.mark.parametrize(
@@ -247,7 +248,8 @@ def test_a_crash_loop_ends_and_rare_deaths_do_not() -> None:
     ],
 )
 def test_the_decision_on_a_death(spec: ProcessSpec, code: int, why: str, end: ProcessEnd, text: str) -> None:
-    assert RestartPolicy(3, 60.0).died(spec, code, 0.0, why) == (end, f"process {text}")
+    death = RestartPolicy(3, 60.0).died(spec, code, 0.0, why)
+    assert death == ChildDeath(spec.name, code, end, f"process {text}")
 
 
 @pytest.mark.fault("P7")

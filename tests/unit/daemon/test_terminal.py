@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.daemon.loops.survey_runner import state_text
 from ccatp.daemon.operator.terminal import RunView, write_run_report
-from ccatp.daemon.supervision.process import open_log
+from ccatp.daemon.supervision.process import Endpoints, RunContext, open_log
 from ccatp.errors import ExitStatus
 from ccatp.links.liveness import RateLimitedLog, kind_of
 from ccatp.links.topics import DangerEvent, LogMessage, MissionStatus, TrackMessage
@@ -24,7 +24,7 @@ STATUS = MissionStatus(seq=-1, t_s=0.0, state="driving", elapsed_s=61.0, eta_s=9
 
 def test_a_run_from_its_first_line_to_its_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / ("a" * 100) / "[b]"  # one line, however long, and no markup
-    view = RunView(CFG, is_sim=True, run_dir=folder)
+    view = RunView(RunContext(CFG, folder, Endpoints(folder), is_sim=True))
     event = DangerEvent(seq=1, t_s=2.0, code=0, cause="", signal="", value=0.0, limit=0.0, off=(False,) * 4)
     row = (1, 0.01, 2, 3, 0.1, 0.2, 0.3, 1e-3)
     for message in (
@@ -62,7 +62,7 @@ def test_a_run_from_its_first_line_to_its_report(tmp_path: Path, capsys: pytest.
 def test_quiet_and_verbose(
     verbosity: int, lines: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    view = RunView(CFG, is_sim=True, run_dir=tmp_path, verbosity=verbosity)
+    view = RunView(RunContext(CFG, tmp_path, Endpoints(tmp_path), is_sim=True), verbosity)
     for message in (STATUS, LogMessage(seq=1, t_s=0.0, level="error", process="main", text="held")):
         view.show(message)
     view.show(replace(STATUS, state="held"))
@@ -74,7 +74,7 @@ def test_quiet_and_verbose(
 def test_danger_is_shown_where_it_holds_the_robot_without_a_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    view = RunView(CFG, is_sim=True, run_dir=tmp_path)
+    view = RunView(RunContext(CFG, tmp_path, Endpoints(tmp_path), is_sim=True))
     event = DangerEvent(seq=1, t_s=2.0, code=0, cause="late", signal="", value=0.0, limit=0.0, off=(False,) * 4)
     for severity in range(7):
         view.show(replace(event, severity=severity))
@@ -83,7 +83,7 @@ def test_danger_is_shown_where_it_holds_the_robot_without_a_code(
 
 
 def test_a_verdict_is_shown_again_only_after_another_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    view = RunView(CFG, is_sim=True, run_dir=tmp_path)
+    view = RunView(RunContext(CFG, tmp_path, Endpoints(tmp_path), is_sim=True))
     stale = DangerEvent(
         seq=1, t_s=2.0, code=0, cause="encoder samples stale", signal="enc", value=0.151, limit=0.15, off=(False,) * 4,
         severity=4,
@@ -97,10 +97,10 @@ def test_a_verdict_is_shown_again_only_after_another_one(tmp_path: Path, capsys:
 
 
 def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    survey = RunView(CFG, is_sim=False, run_dir=tmp_path)
+    survey = RunView(RunContext(CFG, tmp_path, Endpoints(tmp_path), is_sim=False))
     at_point = replace(STATUS, point="1-2-3", error_mm=0.5)
     assert survey.text_of(at_point) == "driving 1-2-3, 1:01 elapsed, 0:09 remaining, arrival 0.50 mm"
-    beacons = RunView(load_radio_config(None), is_sim=True, run_dir=tmp_path)
+    beacons = RunView(RunContext(load_radio_config(None), tmp_path, Endpoints(tmp_path), is_sim=True))
     held = replace(STATUS, cause="operator", state="held", error_mm=25.0)
     assert beacons.text_of(held) == "held (operator), 1:01 elapsed, position known to 2.5 cm"
     titles = [line.partition(";")[0] for line in capsys.readouterr().err.splitlines()]

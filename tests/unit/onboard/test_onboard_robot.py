@@ -21,7 +21,7 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import build_mirror
 from ccatp.onboard.hardware import HardwareError, Readings
 from ccatp.onboard.robot import EdgeThreshold, OnboardRobot
-from ccatp.sim.hardware import MOTOR_12V, SimulatedHardware
+from ccatp.sim.hardware import MOTOR_12V, DriveTrain, SimulatedHardware
 
 CFG = load_onboard_config(overrides={"link.sample_latency_s": 0.0})
 STEP_S = 1.0 / CFG.servo.loop_hz
@@ -33,13 +33,8 @@ class Bench:
 
     def __init__(self, mirror: str = "thesis-m1", **robot: float) -> None:
         cfg = load_config(overrides={"run.mirror": mirror})
-        self.hardware = SimulatedHardware(
-            cfg,
-            build_mirror(cfg.mirror),
-            np.random.default_rng(1),
-            loop_hz=CFG.servo.loop_hz,
-            counts_per_rev=CFG.servo.counts_per_rev,
-        )
+        train = DriveTrain(CFG.servo.loop_hz, CFG.servo.counts_per_rev)
+        self.hardware = SimulatedHardware(cfg, build_mirror(cfg.mirror), np.random.default_rng(1), train)
         onboard = CFG.model_copy(update={"robot": CFG.robot.model_copy(update=robot)})
         self.robot = OnboardRobot(onboard, self.hardware)
         self.robot.join("controller")

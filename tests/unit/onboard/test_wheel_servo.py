@@ -13,7 +13,7 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.onboard.hardware import HardwareError, Readings
 from ccatp.onboard.tuning import Tuning, tune
 from ccatp.onboard.wheel_servo import WheelServo
-from ccatp.sim.hardware import MOTOR_12V, Motor, SimulatedHardware
+from ccatp.sim.hardware import MOTOR_12V, DriveTrain, Motor, SimulatedHardware
 
 DT_S = 0.002
 TIME_CONSTANT_S = 0.0157
@@ -128,10 +128,8 @@ class Lifted:
     def __init__(self, motor: Motor = MOTOR_12V) -> None:
         cfg = load_config()
         rng = np.random.default_rng(1)
-        self.hardware = SimulatedHardware(
-            cfg, build_mirror(cfg.mirror), rng, loop_hz=CFG.loop_hz, counts_per_rev=CFG.counts_per_rev, motor=motor,
-            is_lifted=True,
-        )  # fmt: skip
+        train = DriveTrain(CFG.loop_hz, CFG.counts_per_rev, motor, is_lifted=True)
+        self.hardware = SimulatedHardware(cfg, build_mirror(cfg.mirror), rng, train)
         self.now_s = 0.0
 
     def sleep(self, wait_s: float) -> None:

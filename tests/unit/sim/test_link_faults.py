@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from ccatp.config.load import load_config
-from ccatp.dataloop import serve
+from ccatp.dataloop import SimOutlets, StandInOptions, serve
 from ccatp.onboard import server, sessions
 from ccatp.sim.fault_plan import LINK_TYPES, LOCKSTEP_TYPES, parse_plan
 from ccatp.sim.fault_proxy import FaultProxy, LineStage, OneWayFaults
@@ -233,10 +233,10 @@ async def drive(plan: str, is_over: Callable[[Driver], bool], *, lockstep: bool)
     cfg = load_config(overrides={"run.seed": 3})
     log, stop = Log(), asyncio.Event()
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        faults = parse_plan(plan, "plan")
+        options, outlets = StandInOptions(parse_plan(plan, "plan")), SimOutlets(log=log)
         client = Driver(listener.getsockname()[1])
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(serve(cfg, lockstep=lockstep, stop=stop, listener=listener, log=log, faults=faults))
+            tasks.create_task(serve(cfg, options, lockstep=lockstep, stop=stop, listener=listener, outlets=outlets))
             try:
                 await client.link.connect(LINK_DEADLINE_S)
                 await client.until(lambda: is_over(client))

@@ -13,6 +13,7 @@ from ccatp.config.models import Config, WorldConfig
 from ccatp.core import DeckPose
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.sim.hardware import DriveTrain
 from ccatp.sim.physics import PhysicsHardware
 from ccatp.sim.plant import (
     BodyStep,
@@ -279,9 +280,8 @@ def robot(mirror: str = "fyst-m1", duty: tuple[float, float] = FULL, **physics: 
     cfg = load_config(
         overrides={"run.mirror": mirror, **{f"sim.physics.{key}": value for key, value in physics.items()}}
     )
-    hardware = PhysicsHardware(
-        cfg, build_mirror(cfg.mirror), np.random.default_rng(1), loop_hz=LOOP_HZ, counts_per_rev=3575.0
-    )
+    train = DriveTrain(LOOP_HZ, counts_per_rev=3575.0)
+    hardware = PhysicsHardware(cfg, build_mirror(cfg.mirror), np.random.default_rng(1), train)
     hardware.command_fans(*duty)
     return hardware
 

@@ -10,6 +10,7 @@ from ccatp.beacons.config.models import CricketConfig, RadioConfig, SimObstacleC
 from ccatp.beacons.sim.motes import MoteField, MotePulse, TrueMotes, true_motes, usable_reach
 from ccatp.beacons.sim.radio import (
     MovingTarget,
+    RadioDraws,
     ShadowingField,
     SimDriveCommand,
     TruePose,
@@ -26,8 +27,8 @@ BALL = SimObstacleConfig(x_m=1.0, y_m=0.0, radius_m=0.2)
 
 
 def radio(cfg: RadioConfig, obstacles: tuple[SimObstacleConfig, ...] = ()) -> TrueRadio:
-    streams = np.random.default_rng(1), np.random.default_rng(2)
-    return TrueRadio(-33.0, cfg.sim.radio, (3.0, 3.0), obstacles, 40, *streams)
+    draws = RadioDraws(np.random.default_rng(1), np.random.default_rng(2))
+    return TrueRadio(-33.0, cfg.sim.radio, (3.0, 3.0), obstacles, 40, draws)
 
 
 def drive(cfg: RadioConfig, command: SimDriveCommand, steps: int) -> RadioWorld:

@@ -16,7 +16,7 @@ import pytest
 
 from ccatp.config.load import load_onboard_config
 from ccatp.onboard.devices.bno055 import Bno055, Bno055Sample
-from ccatp.onboard.devices.linux import GpioLines, I2cBus, LinuxHardware, open_serial
+from ccatp.onboard.devices.linux import DeviceAccess, GpioLines, I2cBus, LinuxHardware, open_serial
 from ccatp.onboard.hardware import Hardware, HardwareError
 from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime, voltage_of
 
@@ -47,10 +47,8 @@ class Rig:
         self.unit, self.daq = FakeBno055(self.time), FakeDaq(self.time)
         self.pwm, self.bridge = FakePwm(root, monkeypatch, {0: 2, 1: 2}), FakeBridge()
         self.bus_error: HardwareError | None = None
-        self.linux = LinuxHardware(
-            CONFIG, self.time, open_bus=self.open_bus, open_port=self.daq.open, open_lines=self.bridge.open,
-            pwm_root=root, imu=reader, sleep=self.time.sleep,
-        )  # fmt: skip
+        access = DeviceAccess(self.open_bus, self.daq.open, self.bridge.open, root, reader, self.time.sleep)
+        self.linux = LinuxHardware(CONFIG, self.time, access)
         self.hardware: Hardware = self.linux
 
     def open_bus(self, number: int) -> FakeBno055:
