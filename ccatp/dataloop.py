@@ -58,7 +58,7 @@ class MotorRobot(OnboardRobot, SimulatedRobot, SurveyTruth):
         servo, sim = onboard.servo, cfg.sim.robot
         train = DriveTrain(servo.loop_hz, servo.counts_per_rev)
         hardware = _hardware_class(cfg)(
-            cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), train, start
+            cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), train, start=start
         )
         self.world = hardware.world
         super().__init__(onboard, hardware, round(cfg.world.commands_delay_s * sim.frame_hz))
@@ -169,7 +169,7 @@ def motor_robot(cfg: Config, start: DeckPose | None = None) -> MotorRobot:
 
 def survey_robot(cfg: Config, faults: FaultPlan | None = None, start: DeckPose | None = None) -> Robot:
     """The survey robot of a configuration, just booted, at ``start`` or at base."""
-    return Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), faults, start)
+    return Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), faults, start=start)
 
 
 def _keep(file: SimPoseFile, robot: Robot | MotorRobot) -> None:

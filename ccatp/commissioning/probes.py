@@ -95,7 +95,8 @@ def _stand_ins(cfg: Config) -> Iterator[Config]:
         any_port = {part: getattr(cfg.sim, part).model_copy(update={"port": 0}) for part in ("robot", "etalon")}
         cfg = cfg.model_copy(update={"sim": cfg.sim.model_copy(update=any_port)})
         sockets = {
-            name: stack.enter_context(listen(section, at.host, at.port)) for name, section, at in simulated_servers(cfg)
+            one.process: stack.enter_context(listen(one.section, one.at.host, one.at.port))
+            for one in simulated_servers(cfg)
         }
         cfg = with_addresses(cfg, sockets)
         (folder / "config.toml").write_text(dump_config(cfg), encoding="utf-8")

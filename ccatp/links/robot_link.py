@@ -157,13 +157,17 @@ class RobotLink(asyncio.Protocol):
         self._writer: LineWriter | None = None
         self._hello: Hello | None = None
         self._joining: asyncio.Future[Hello] | None = None
-        self._is_joined = self._is_closing = self._is_paused = False
+        self._is_joined = False
+        self._is_closing = False
+        self._is_paused = False
         self._lines = LineBuffer()
         self._bad = BadLineCounter()
         self._budget: BadLineLimit | None = None
         self._last_seq = self.session = -1
         self.newest: Sensors | None = None
-        self._why = self._oddity = self.first_bad_line = ""
+        self._why = ""
+        self._oddity = ""
+        self.first_bad_line = ""
 
     @property
     def has_frames(self) -> bool:
@@ -321,7 +325,7 @@ class RobotLink(asyncio.Protocol):
 
         ``ValueError``: a set point that is not finite.
         """
-        line = format_drive(seq, ack, wr_rad_s, wl_rad_s, steer_rad)
+        line = format_drive(seq, ack, wr_rad_s, wl_rad_s, steer=steer_rad)
         if self._is_paused:
             self.counts["unsent"] += 1
         elif self._writer is not None:
@@ -332,7 +336,7 @@ class RobotLink(asyncio.Protocol):
         if self._is_paused:
             self.counts["unsent"] += 1
         else:
-            self.send_raw(format_permit(seq, ack, forward, reverse, turn))
+            self.send_raw(format_permit(seq, ack, forward, reverse, turn=turn))
 
     def send_fans(self, seq: int, duty: tuple[float, float]) -> None:
         """Send fan duties (left, right), 0 to 1."""

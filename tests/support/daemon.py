@@ -84,17 +84,17 @@ class Daemon:
         clock = asyncio.get_running_loop().time
 
         def send_drive(
-            link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float, steer: float | None = None
+            link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float, steer_rad: float | None = None
         ) -> None:
             if wr_rad_s or wl_rad_s:
                 self.sent[seq] = clock()
                 self._note_late("drive", ack)
-            SEND_DRIVE(link, seq, ack, wr_rad_s, wl_rad_s, steer)
+            SEND_DRIVE(link, seq, ack, wr_rad_s, wl_rad_s, steer_rad=steer_rad)
 
-        def send_permit(link: RobotLink, seq: int, ack: int, *allowed: bool) -> None:
-            if any(allowed):
+        def send_permit(link: RobotLink, seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> None:
+            if forward or reverse or turn:
                 self._note_late("permit", ack)
-            SEND_PERMIT(link, seq, ack, *allowed)
+            SEND_PERMIT(link, seq, ack, forward, reverse, turn=turn)
 
         def set_points(rules: MotionRules, until_s: float) -> tuple[float, float]:
             found = SET_POINTS(rules, until_s)

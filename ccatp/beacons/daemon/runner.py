@@ -254,7 +254,9 @@ class BeaconRunner(MissionRunner):
         if self._trail:
             shapes.append(RobotShape("trail", "trail", *self._trail[-1], outline_m=list(self._trail)))
         shapes.append(
-            RobotShape("robot", "robot", x_m, y_m, belief.ellipse[2:], heading_rad, radius_m=cfg.vehicle.radius_m)
+            RobotShape(
+                "robot", "robot", x_m, y_m, belief.ellipse[2:], heading_rad=heading_rad, radius_m=cfg.vehicle.radius_m
+            )
         )
         return shapes
 

@@ -125,17 +125,12 @@ class PublishedVerdict(NamedTuple):
     findings: frozenset[str] = frozenset()
     emergencies: tuple[Cause, ...] = ()
 
-    @property
-    def verdict(self) -> tuple[EventCode, Cause, Severity]:
-        """The part of the verdict alone."""
-        return self[:3]
-
 
 class DangerLoop:
     """Connects the monitor to the robot link, the bus and the observatory channel: the work of the danger process."""
 
     def __init__(self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        self.loop = RobotLoop("danger", "monitor", args, context, self)
+        self.loop = RobotLoop("danger", "monitor", args, context, work=self)
         self.session = self.loop.session
         self.log = self.loop.log
         self.heartbeat = self.loop.heartbeat
@@ -158,7 +153,7 @@ class DangerLoop:
             cfg.observatory,
             self.monitor,
             lambda: self.heartbeat.frame_age_s if self._seq >= 0 else None,
-            self.log,
+            log=self.log,
         )
 
     def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
@@ -248,7 +243,7 @@ class DangerLoop:
     def answer_again(self) -> None:
         permit = self._permits.permit()
         if permit is not None:
-            self.session.link.send_permit(permit.seq, permit.ack, permit.forward, permit.reverse, permit.turn)
+            self.session.link.send_permit(permit.seq, permit.ack, permit.forward, permit.reverse, turn=permit.turn)
 
     def is_frame_due(self) -> bool:
         """Never for this loop: main decides when a frame is answered."""
@@ -269,11 +264,11 @@ class DangerLoop:
             return
         found, emergencies = self.monitor.found, self.monitor.latch.causes
         names = frozenset(finding.condition.name for finding in found)
-        news = PublishedVerdict(verdict.code, verdict.cause, verdict.severity, names, tuple(emergencies))
+        news = PublishedVerdict(verdict.code, verdict.cause, verdict.severity, names, emergencies=tuple(emergencies))
         before, self._published = self._published, news
         if news == before:
             return
-        is_verdict_new = news.verdict != before.verdict
+        is_verdict_new = news[:3] != before[:3]
         active = [ActiveCause(one.condition.name, text_of(one.cause), one.severity) for one in found]
         others = [verdict.cause, *(cause for cause in emergencies if cause != verdict.cause)]
         active += [active_cause(cause) for cause in others if cause and cause not in [one.cause for one in found]]

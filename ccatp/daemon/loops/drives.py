@@ -20,7 +20,7 @@ class DriveSender:
     def send(self, ack: int, drive: DriveCommand) -> int:
         """Send the drive that was computed from frame ``ack``; returns its number."""
         sent = self._rule.drive(ack, drive.right_rad_s, drive.left_rad_s, drive.steer_rad)
-        self._session.link.send_drive(sent.seq, sent.ack, sent.wr, sent.wl, sent.steer)
+        self._session.link.send_drive(sent.seq, sent.ack, sent.wr, sent.wl, steer_rad=sent.steer)
         self._on_drive(sent.seq, sent.wr, sent.wl)
         return sent.seq
 
@@ -28,4 +28,4 @@ class DriveSender:
         """Repeat the newest drive of the session, if any, with a new number."""
         sent = self._rule.repeat()
         if sent is not None:
-            self._session.link.send_drive(sent.seq, sent.ack, sent.wr, sent.wl, sent.steer)
+            self._session.link.send_drive(sent.seq, sent.ack, sent.wr, sent.wl, steer_rad=sent.steer)

@@ -64,7 +64,7 @@ class MainLoop:
         make_runner: Callable[[MissionHost], MissionRunner],
     ) -> None:
         cfg = args.config
-        self.loop = RobotLoop("main", "controller", args, context, self)
+        self.loop = RobotLoop("main", "controller", args, context, work=self)
         self.session = self.loop.session
         self.log = self.loop.log
         self.publisher = self.loop.publisher
@@ -88,7 +88,7 @@ class MainLoop:
         self._standstill = StandstillWatch(runner, self.heartbeat, self._alarms.alarms, cfg.robot)
         self._drives = DriveSender(self.session, runner.on_drive)
         self._lockstep = LockstepTime(runner, self._drives)
-        self._real_time = RealTime(runner, self._drives, self._pauses, self.loop.lateness, cfg.robot)
+        self._real_time = RealTime(runner, self._drives, self._pauses, self.loop.lateness, limits=cfg.robot)
         self._time: FrameTime = self._real_time
         self._operator = OperatorServer(args.endpoints.of("control"), self)
 
@@ -292,7 +292,8 @@ class MainLoop:
             is_first = self._is_new_session
             is_going_on = is_first and clock.has_begun
             t_s, dt_s = clock.take(seq, sensors.t, self.frame_period_s)
-            frame = TimedFrame(sensors, raw, t_s, dt_s, is_first, is_first or seq % ESTIMATE_FRAMES == 0)
+            is_due = is_first or seq % ESTIMATE_FRAMES == 0
+            frame = TimedFrame(sensors, raw, t_s, dt_s, is_first=is_first, is_estimate_due=is_due)
             if is_first:
                 self._begin_drives(dt_s if is_going_on else 0.0)
             self.heartbeat.frame_s = time.monotonic()

@@ -24,7 +24,7 @@ def _run(
 
     async def run(stop: asyncio.Event) -> int:
         rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
-        server = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, rng)
+        server = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, rng=rng)
         server.model.faults = tuple(fault for fault in faults if fault.signal == "laser")
         await server.start(listener)
         try:

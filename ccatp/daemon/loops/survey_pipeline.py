@@ -70,9 +70,9 @@ class SurveyPipeline:
         imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
         echo, set_points = sensors.cmd, None
         if frame.dt_s > 0.0:
-            acted = self.sent.acted(frame.dt_s, echo.seq, echo.age, echo.permit_age, echo.held)
+            acted = self.sent.acted(frame.dt_s, echo.seq, echo.age, echo.permit_age, is_held=echo.held)
             set_points = None if is_odometry_off else acted
-        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity, set_points)
+        localizer.step(sensors.t, imu, enc, sensors.edge, gravity=sensors.gravity, set_points=set_points)
         if localizer.coasted is not None:  # a replay does not know the drives
             self._sink.record_treatment(sensors, "coasted", localizer.coasted)
         if localizer.hold_cause:
@@ -84,7 +84,7 @@ class SurveyPipeline:
             return
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
-        ahead = self.sent.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
+        ahead = self.sent.ahead(place, v, omega, echo.seq, echo_age_s=echo.age, is_held=echo.held, creep=creep)
         sigmas_of = self.position_sigma_m, self.parts.heading_sigma_rad
         deck_of, turn_creep_of = self.mirror.deck_pose, self.parts.turn_creep_m_rad
         self.motion = StateEstimate(
@@ -106,7 +106,9 @@ class SurveyPipeline:
             self._apply_requests(sensors, command)
             state = mission.state
         # The gate compares with the verdict's time, which is the robot's own and may have jumped.
-        right, left = self.gate.pass_through(command.twist, verdict, motion.dt_s, sensors.t, lag_s, state.purpose)
+        right, left = self.gate.pass_through(
+            command.twist, verdict, motion.dt_s, sensors.t, age_s=lag_s, purpose=state.purpose
+        )
         if command.at_rest or command.measure:
             self._sink.execute(command, motion)
         if frame.is_estimate_due:

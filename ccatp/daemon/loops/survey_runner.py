@@ -69,7 +69,9 @@ class CheckpointWriter:
         """Write the state of frame ``seq``; durably if abort or hold changed."""
         state = self._written = self._mission.state
         self._period = seq // PERIOD_FRAMES
-        record = Checkpoint.of(self._localizer, state, seq, t_s, elapsed_s, self.boot, self._run_id)
+        record = Checkpoint.of(
+            self._localizer, state, seq, t_s, elapsed_s=elapsed_s, boot=self.boot, run_id=self._run_id
+        )
         pose = record.pose
         if not isfinite(pose.x_m + pose.y_m + pose.heading_rad + record.sigma_m + record.heading_sigma_rad):
             return  # keep the last valid one
@@ -143,7 +145,7 @@ class SurveyRunner(MissionRunner):
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._follow = LaserFollow(cfg)
         checks = FixChecks(FixGate(parts.mirror, cfg), self._follow)
-        self._fix_service = FixService(self._etalon, checks, parts, store, self.telemetry, host)
+        self._fix_service = FixService(self._etalon, checks, parts, store, telemetry=self.telemetry, host=host)
         self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
@@ -337,7 +339,7 @@ class SurveyRunner(MissionRunner):
             # For the localizer, the time of a fix is by the robot's own clock.
             t_s = motion.t_s - self._clock.offset_s
             self._fix_service.begin(
-                FixRequest(mission.state.request, t_s, mission.state.measuring_point, expected, pose)
+                FixRequest(mission.state.request, t_s, mission.state.measuring_point, expected, estimate=pose)
             )
 
     def publish(self, frame: TimedFrame) -> None:
@@ -378,4 +380,4 @@ def open_survey(cfg: Config, args: ProcessArgs) -> Iterator[Callable[[MissionHos
     """Open the parts and the database of a survey, new or taken over; yields a factory of the mission."""
     parts, store = build_parts(cfg, args)
     with store:
-        yield lambda host: SurveyRunner(cfg, args, host, parts, store)
+        yield lambda host: SurveyRunner(cfg, args, host, parts, store=store)

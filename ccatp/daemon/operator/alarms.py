@@ -84,7 +84,9 @@ class AlarmList:
     def __init__(
         self, run_dir: Path, log: structlog.typing.FilteringBoundLogger, now: Callable[[], str] = utc_now
     ) -> None:
-        self._path, self._log, self._now = run_dir / ALARMS_FILE, log, now
+        self._path = run_dir / ALARMS_FILE
+        self._log = log
+        self._now = now
         self._alarms: dict[str, Alarm] = {}
         self._since: dict[str, tuple[float, float]] = {}  # start of the active ones by the robot's and the host's clock
         self._lines = 0
@@ -112,10 +114,10 @@ class AlarmList:
                 continue
             alarm, word = self._alarms.get(name), cast(SeverityName, severity.name.lower())
             if alarm is None or alarm.ended or Severity[alarm.severity.upper()] < severity:
-                self._happened("raised", name, t_s, word, "; ".join(texts))
+                self._happened("raised", name, t_s, word, cause="; ".join(texts))
         for alarm in list(self._alarms.values()):
             if not alarm.ended and alarm.name not in active:
-                self._happened("ended", alarm.name, t_s, alarm.severity, alarm.cause)
+                self._happened("ended", alarm.name, t_s, alarm.severity, cause=alarm.cause)
 
     def acknowledge(self, name: str, by: str, t_s: float) -> str | None:
         """Acknowledge an alarm; returns why it was refused, or None. A second time has no effect."""
@@ -124,13 +126,13 @@ class AlarmList:
             known = ", ".join(one.name for one in self.alarms)
             return f"no alarm {name!a}; " + (f"the list has {known}" if known else "the list is empty")
         if not alarm.acknowledged_by:
-            self._happened("acknowledged", name, t_s, alarm.severity, alarm.cause, by)
+            self._happened("acknowledged", name, t_s, alarm.severity, cause=alarm.cause, by=by)
         return None
 
     def _happened(
         self, what: EventName, name: str, t_s: float, severity: SeverityName, cause: str, by: str = ""
     ) -> None:
-        event = AlarmEvent(self._now(), round(t_s, 3), what, name, severity, cause, by)
+        event = AlarmEvent(self._now(), round(t_s, 3), what, name, severity=severity, cause=cause, by=by)
         self._apply(event)
         self._log.info(f"alarm_{what}", name=name, severity=severity, cause=cause, by=by, t_s=t_s)
         if self._lines >= MAX_LINES:
@@ -161,7 +163,9 @@ class AlarmList:
             if known is not None and known.ended:
                 alarm.count = known.count + 1
             elif known is not None:  # its severity was raised
-                alarm.since, alarm.since_s, alarm.count = known.since, known.since_s, known.count
+                alarm.since = known.since
+                alarm.since_s = known.since_s
+                alarm.count = known.count
         elif known is None:
             return
         elif event.event == "acknowledged":

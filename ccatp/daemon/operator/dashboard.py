@@ -64,7 +64,7 @@ async def serve_page(
     reader = BusReader(context, endpoints.of, view, is_sim=is_sim, wants=wants)
     hub = StateBroadcaster(reader, view, settings.rate_hz)
     commands = CommandEndpoint(context, endpoints.of, settings.command_timeout_s)
-    app = build_app(hub, commands, ground | run_ground(run_dir), settings, tokens, log)
+    app = build_app(hub, commands, ground | run_ground(run_dir), settings, tokens=tokens, log=log)
 
     async def broadcast() -> None:
         await hub.run(stop)

@@ -38,8 +38,12 @@ class ObservatoryServer:
         age_s: Callable[[], float | None],
         log: structlog.typing.FilteringBoundLogger,
     ) -> None:
-        self._local_endpoint, self._cfg, self._keys = local_endpoint, cfg, check_observatory(cfg)
-        self._monitor, self._age_s, self._log = monitor, age_s, log
+        self._local_endpoint = local_endpoint
+        self._cfg = cfg
+        self._keys = check_observatory(cfg)
+        self._monitor = monitor
+        self._age_s = age_s
+        self._log = log
         self._clients = ClientsFile(Path(cfg.clients_file), CLIENTS_FILE)
         self._accepted = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
         self._refused = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)

@@ -71,7 +71,9 @@ class Streamer:
         streams: Sequence[LiveStream],
         report: Callable[[str], None],
     ) -> None:
-        self._context, self._streams, self._report = context, streams, report
+        self._context = context
+        self._streams = streams
+        self._report = report
         self._runtime_dir, self._endpoints = runtime_dir, Endpoints(runtime_dir)
         self._heartbeats = Subscriber(context, [self._endpoints.of("main")], ["heartbeat.main"])
         self._run: Subscriber | None = None
@@ -118,7 +120,7 @@ class Streamer:
         self._clock = RobotClock(is_simulation=is_sim)
         self._views = Views(build_mirror(cfg.mirror), cfg.robot.puck_height_m, self._clock)
         mirror, world, run = cfg.mirror.name, cfg.world.name if is_sim else "", cfg.run
-        fact = RunFact(mirror, world, is_sim, run.seed, run.filter, str(run_dir))
+        fact = RunFact(mirror, world, is_sim, run.seed, filter=run.filter, run_dir=str(run_dir))
         self._send((RecordedMessage(RUN, 0.0, json.dumps(msgspec.to_builtins(fact)).encode()), *self._views.begin()))
         names = ("main", "danger", "truth") if is_sim else ("main", "danger")
         topics = dict.fromkeys((*PASSED_ON, *TURNED_INTO_VIEWS))

@@ -114,7 +114,7 @@ class RunView:
         """Show a verdict that is new; an event also reports that further findings began or ended."""
         verdict = message.code, message.cause, message.severity
         if verdict != self._verdict and (message.code or message.severity in SHOWN):
-            text = danger_text(message.condition, message.cause, message.signal, message.value, message.limit)
+            text = danger_text(message.condition, message.cause, message.signal, message.value, limit=message.limit)
             what = f"code {message.code}" if message.code else Severity(message.severity).name.lower()
             self.show_message("warning", f"danger: {what}, {text}, at {message.t_s:.2f} s")
         self._verdict = verdict

@@ -63,7 +63,9 @@ class AlarmWebhook:
     def __init__(
         self, cfg: AlarmsConfig, run: str, log: structlog.typing.FilteringBoundLogger, known: Iterable[Alarm] = ()
     ) -> None:
-        self._cfg, self._run, self._log = cfg, run, log
+        self._cfg = cfg
+        self._run = run
+        self._log = log
         self._alarms = {alarm.name: alarm for alarm in known}
         self._waiting: deque[AlarmPost] = deque()
         self._left_out = 0
@@ -81,7 +83,7 @@ class AlarmWebhook:
             return
         with self._changed:
             for event, alarm in changes(self._alarms, alarms):
-                self._waiting.append(AlarmPost(event, self._run, status.state, alarm, self._left_out))
+                self._waiting.append(AlarmPost(event, self._run, status.state, alarm, left_out=self._left_out))
                 self._left_out = 0
             while len(self._waiting) > MOST_WAITING:
                 self._left_out += 1 + self._waiting[1].left_out

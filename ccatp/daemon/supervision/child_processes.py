@@ -147,7 +147,9 @@ class ProcessManager:
         command_of: Callable[[ProcessSpec, bool], tuple[list[str], tuple[int, ...]]],
         notify_operator: Callable[[str, str], None],
     ) -> None:
-        self._cfg, self._command_of, self._notify_operator = cfg, command_of, notify_operator
+        self._cfg = cfg
+        self._command_of = command_of
+        self._notify_operator = notify_operator
         self._policy = RestartPolicy(cfg.restart_limit, cfg.restart_window_s)
         self._children: dict[str, _Child] = {}
         self._niceness = os.getpriority(os.PRIO_PROCESS, 0)
@@ -335,10 +337,20 @@ def process_table(cfg: MissionConfig) -> tuple[ProcessSpec, ...]:
     return table
 
 
-def simulated_servers(cfg: MissionConfig) -> list[tuple[str, str, ServerAddress]]:
-    """Process, section of the configuration and address of each simulated server."""
+class SimulatedServer(NamedTuple):
+    """Process, section of the configuration and address of a simulated server."""
+
+    process: str
+    section: str
+    at: ServerAddress
+
+
+def simulated_servers(cfg: MissionConfig) -> list[SimulatedServer]:
+    """The simulated servers of a run of a configuration."""
     servers = [one for one in process_table(cfg) if one.is_simulator]
-    return [(one.name, one.listens, getattr(cfg.sim, one.listens.removeprefix("sim."))) for one in servers]
+    return [
+        SimulatedServer(one.name, one.listens, getattr(cfg.sim, one.listens.removeprefix("sim."))) for one in servers
+    ]
 
 
 C = TypeVar("C", bound=MissionConfig)
@@ -350,8 +362,8 @@ def with_addresses(cfg: C, sockets: Mapping[str, socket.socket]) -> C:
     The section ``sim`` stays as it is, so that a resumed run with port 0 takes any free port again.
     """
     changes: dict[str, object] = {}
-    for process, section, _ in simulated_servers(cfg):
-        host, port = sockets[process].getsockname()[:2]
-        name = section.removeprefix("sim.")
+    for server in simulated_servers(cfg):
+        host, port = sockets[server.process].getsockname()[:2]
+        name = server.section.removeprefix("sim.")
         changes[name] = getattr(cfg, name).model_copy(update={"host": host, "port": port})
     return cfg.model_copy(update=changes)

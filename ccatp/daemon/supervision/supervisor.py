@@ -322,8 +322,9 @@ def _run(options: RunOptions, cfg: MissionConfig) -> int:
         stack.callback((runtime_dir / TOKEN_FILE).unlink, missing_ok=True)
         sockets: dict[str, socket.socket] = {}
         if options.sim:
-            for name, section, at in simulated_servers(cfg):
-                sockets[name] = stack.enter_context(listen(section, at.host, at.port))
+            for server in simulated_servers(cfg):
+                listener = listen(server.section, server.at.host, server.at.port)
+                sockets[server.process] = stack.enter_context(listener)
             cfg = with_addresses(cfg, sockets)
         has_page = kind.page is not None
         page = open_page_socket(cfg.dashboard if has_page else cfg.dashboard.model_copy(update={"enabled": False}))
@@ -347,7 +348,7 @@ def _run(options: RunOptions, cfg: MissionConfig) -> int:
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_text(read_toml(options.faults_file), encoding="utf-8")
         context = RunContext(cfg, run_dir, Endpoints(runtime_dir), is_sim=options.sim, locks=locks)
-        return SupervisedRun(options, context, sockets, page, started_s).run()
+        return SupervisedRun(options, context, sockets, page, started_s=started_s).run()
 
 
 def permit_open_files() -> None:

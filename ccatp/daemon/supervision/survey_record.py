@@ -36,7 +36,9 @@ class _SurveySession:
     """Messages of one session of a survey."""
 
     def __init__(self, cfg: Config, mirror: Mirror, *, is_sim: bool) -> None:
-        self._mirror, self._code, self.has_status = mirror, 0, False
+        self._mirror = mirror
+        self._code = 0
+        self.has_status = False
         self._frames_before = 0  # of the robot's present boot; danger names frames by the robot's own numbers
         self.builder = SummaryBuilder(cfg, mirror, is_sim=is_sim)
 
@@ -77,7 +79,9 @@ class SurveyRecord(RunRecord):
     """Messages of a survey, for its summary; its views for Foxglove and PlotJuggler."""
 
     def __init__(self, cfg: Config, run_dir: Path, clock: RobotClock, is_sim: bool) -> None:
-        self._cfg, self._run_dir, self._is_sim = cfg, run_dir, is_sim
+        self._cfg = cfg
+        self._run_dir = run_dir
+        self._is_sim = is_sim
         self.mirror = build_mirror(cfg.mirror)
         self._session = _SurveySession(cfg, self.mirror, is_sim=is_sim)
         self._views = Views(self.mirror, cfg.robot.puck_height_m, clock)
