@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from ccatp.conditions import RESTARTED
 from ccatp.config.models import Config
 from ccatp.core import Cause, PointId
-from ccatp.daemon.loops.danger_loop import EMERGENCIES_FILE, active_ids
+from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE, active_ids
 from ccatp.daemon.supervision.process import ProcessArgs
 from ccatp.daemon.supervision.run_dir import read_run_id
 from ccatp.errors import CcatpError, ExitStatus

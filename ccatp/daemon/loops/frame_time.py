@@ -11,9 +11,9 @@ from ccatp.conditions import FRAME_LATE, FRAMES_OLD, text_of
 from ccatp.config.models import LinkConfig
 from ccatp.core import Verdict
 from ccatp.daemon.loops.drives import DriveSender
+from ccatp.daemon.loops.frame_lateness import FrameAge, LatenessStatistics
 from ccatp.daemon.loops.mission_runner import STILL, DriveCommand, MissionRunner, TimedFrame
 from ccatp.daemon.loops.pauses import PauseWatch
-from ccatp.daemon.loops.robot_session import FrameAge, LatenessStatistics
 
 # Frames that arrive while a path is planned for a standing robot are late; they are served within this time.
 CATCH_UP_S = 0.5

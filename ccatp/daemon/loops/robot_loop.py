@@ -9,8 +9,9 @@ from typing import Any, Protocol
 import zmq
 import zmq.asyncio
 
+from ccatp.daemon.loops.frame_lateness import LatenessStatistics
 from ccatp.daemon.loops.lockstep import LockstepAnswers, LockstepWatch
-from ccatp.daemon.loops.robot_session import LatenessStatistics, RobotSession, SessionHandler
+from ccatp.daemon.loops.robot_session import RobotSession, SessionHandler
 from ccatp.daemon.supervision.process import ProcessArgs, open_log, unless_stopped
 from ccatp.links import realtime
 from ccatp.links.bus import PERIOD_S, HeartbeatPublisher, PeerSubscriber, Publisher

@@ -2,19 +2,18 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from math import isfinite
-from pathlib import Path
 
 from ccatp.conditions import UNATTENDED_FAULT, text_of
 from ccatp.config.models import Config
-from ccatp.control.gate import Denial, DriveGate, FanGate
-from ccatp.core import NO_CAUSE, Cause, Verdict
+from ccatp.control.gate import FanGate
+from ccatp.core import Cause, Verdict
+from ccatp.daemon.loops.checkpoint_writer import CheckpointWriter
 from ccatp.daemon.loops.checkpoints import build_parts
 from ccatp.daemon.loops.fix_service import FixChecks, FixRequest, FixService
+from ccatp.daemon.loops.gate_log import GateLog
 from ccatp.daemon.loops.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionHost, MissionRunner, TimedFrame
 from ccatp.daemon.loops.survey_pipeline import SurveyPipeline
 from ccatp.daemon.supervision.process import ProcessArgs
-from ccatp.daemon.supervision.run_dir import read_run_id
 from ccatp.errors import DaemonUnreachableError, ExitStatus
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry
@@ -28,59 +27,17 @@ from ccatp.links.topics import (
     Treatment,
     TreatmentKind,
 )
-from ccatp.localizer import Localizer
-from ccatp.records.checkpoint import CHECKPOINT_FILE, CheckpointFile
 from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
-from ccatp.survey.composition import Checkpoint, SurveyParts
-from ccatp.survey.events import HELD, Abort, Fault, MissionState, SurveyOutcome, TrackingGap
+from ccatp.survey.composition import SurveyParts
+from ccatp.survey.events import Abort, Fault, MissionState, SurveyOutcome, TrackingGap
 from ccatp.survey.fix_gate import FixGate
 from ccatp.survey.laser_follow import LaserFollow
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import SurveyState, by_reason
+from ccatp.survey.state import by_reason
 from ccatp.survey.statechart import Mission
-
-# Period of the checkpoint in frames, ten per second.
-PERIOD_FRAMES = 10
-
-
-class CheckpointWriter:
-    """Keeps the checkpoint up to date; ``boot``: boot number of the robot."""
-
-    def __init__(self, run_dir: Path, localizer: Localizer, mission: Mission, is_patient: bool) -> None:
-        self._file = CheckpointFile(run_dir / CHECKPOINT_FILE, is_patient=is_patient)
-        self._localizer, self._mission = localizer, mission
-        self._run_id = read_run_id(run_dir)
-        self._written: SurveyState | None = None
-        self._in_force = (NO_CAUSE, NO_CAUSE)
-        self._period = -1
-        self.boot = -1
-
-    def is_due(self, seq: int) -> bool:
-        """Whether to write in this frame: the first of ten, that of an abort, or a change of the state in a hold."""
-        if seq // PERIOD_FRAMES != self._period:
-            return True
-        state = self._mission.state
-        return state.abort_cause != self._in_force[0] or (state.mode is HELD and state is not self._written)
-
-    def write(self, seq: int, t_s: float, elapsed_s: float) -> None:
-        """Write the state of frame ``seq``; durably if abort or hold changed."""
-        state = self._written = self._mission.state
-        self._period = seq // PERIOD_FRAMES
-        record = Checkpoint.of(
-            self._localizer, state, seq, t_s, elapsed_s=elapsed_s, boot=self.boot, run_id=self._run_id
-        )
-        pose = record.pose
-        if not isfinite(pose.x_m + pose.y_m + pose.heading_rad + record.sigma_m + record.heading_sigma_rad):
-            return  # keep the last valid one
-        before, self._in_force = self._in_force, (state.abort_cause, state.cause if state.is_held_by_hand else NO_CAUSE)
-        self._file.write(record, is_durable=self._in_force != before)
-
-    def close(self) -> None:
-        """Write the waiting record."""
-        self._file.close()
 
 
 def state_text(state: MissionState, cause: str) -> str:
@@ -92,33 +49,6 @@ def state_text(state: MissionState, cause: str) -> str:
 
 
 GIVEN_UP = "no calibration drive, because the robot was held elsewhere: slip and heading are learned on the way"
-DENIAL_REPEAT_S = 1.0
-
-
-class GateLog:
-    """Reports denials of the gate, the same one at most once in ``DENIAL_REPEAT_S``."""
-
-    def __init__(self, gate: DriveGate, notify: Callable[[str, str], None]) -> None:
-        self._gate = gate
-        self._notify = notify
-        self._logged_s: dict[Denial, float] = {}
-
-    def update(self, t_s: float) -> None:
-        """Report a drive denied in the frame of robot time ``t_s``."""
-        denial = self._gate.denial
-        if denial is None:
-            return
-        logged_s = self._logged_s.get(denial)
-        # The first comparison is for a clock that went back, which must not suppress the report.
-        if logged_s is not None and 0.0 <= t_s - logged_s < DENIAL_REPEAT_S:
-            return
-        self._logged_s[denial] = t_s
-        self._notify("warning", f"drive denied: {denial} ({self._gate.denied[denial]} so far)")
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Number of denials by the reason, without zeros."""
-        return {denial.name.lower(): count for denial, count in self._gate.denied.items() if count}
 
 
 class SurveyRunner(MissionRunner):

@@ -14,7 +14,7 @@ from uuid import uuid4
 
 from ccatp.config.files import read_input, read_text, write_durably
 from ccatp.config.mission import MissionConfig
-from ccatp.daemon.loops.danger_loop import EMERGENCIES_FILE
+from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE
 from ccatp.daemon.supervision.run_text import RunText
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import BESIDE, LOCK_FILE, TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from ccatp.config.models import LimitsConfig
 from ccatp.control.gate import Denial, DriveGate, FanGate, Purpose
 from ccatp.core import EventCode, Twist, Verdict
-from ccatp.daemon.loops.survey_runner import GateLog
+from ccatp.daemon.loops.gate_log import GateLog
 from ccatp.kinematics import twist_of, wheel_rates
 from ccatp.survey.events import PURPOSES, MissionState
 from tests.support.scenario import config_of

@@ -20,7 +20,7 @@ from ccatp import conditions
 from ccatp.conditions import text_of
 from ccatp.config.models import AlarmsConfig
 from ccatp.core import Cause, EmergencyKind, Severity
-from ccatp.daemon.loops.danger_loop import EMERGENCIES_FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
+from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
 from ccatp.daemon.operator import alarms, webhook
 from ccatp.daemon.operator.alarms import LEAST_S, ActiveCause, AlarmList, active_cause, read_history
 from ccatp.daemon.operator.webhook import AlarmWebhook, changes

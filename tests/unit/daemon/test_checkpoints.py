@@ -17,8 +17,8 @@ from ccatp.conditions import EARTHQUAKE, text_of
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, EventCode, Fix, PointId, Severity, Verdict
+from ccatp.daemon.loops.checkpoint_writer import CheckpointWriter
 from ccatp.daemon.loops.checkpoints import StoreUnusable, build_parts
-from ccatp.daemon.loops.survey_runner import CheckpointWriter
 from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.daemon.supervision.run_dir import keep_origin
 from ccatp.errors import ConfigError

@@ -16,15 +16,8 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.daemon.loops.fix_service import FixRequest
-from ccatp.daemon.loops.robot_session import (
-    FIRST_DELAY_S,
-    LONGEST_DELAY_S,
-    FrameAge,
-    LatenessStatistics,
-    RobotSession,
-    SessionHandler,
-    delay_s,
-)
+from ccatp.daemon.loops.frame_lateness import FrameAge, LatenessStatistics
+from ccatp.daemon.loops.robot_session import FIRST_DELAY_S, LONGEST_DELAY_S, RobotSession, SessionHandler, delay_s
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_link import RobotTimeout

@@ -16,7 +16,7 @@ from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.daemon.run import PROCESSES as BEACON_PROCESSES
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.daemon.loops.danger_loop import EMERGENCIES_FILE
+from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE
 from ccatp.daemon.supervision.process import run_dir_in
 from ccatp.daemon.supervision.run_dir import (
     UNFINISHED_FILE,
