@@ -72,9 +72,10 @@ class Mission:
 class Runner(mission_runner.MissionRunner):
     """Drives each side, then turns by a right angle; ``_lasts_s``: how long it has driven the side, or turned."""
 
-    def __init__(self, cfg: SquareConfig, loop: Any) -> None:
-        super().__init__(Mission(), Telemetry(loop.publisher, loop.log, "square_track", topics.TrackBatch))
-        self._cfg, self._loop, self._drive, self._pose = cfg, loop, STILL, (0.0, 0.0, 0.0)
+    def __init__(self, cfg: SquareConfig, host: mission_runner.MissionHost) -> None:
+        super().__init__(Mission(), Telemetry(host.publisher, host.log, "square_track", topics.TrackBatch))
+        self._cfg, self._host = cfg, host
+        self._drive, self._pose = STILL, (0.0, 0.0, 0.0)
         self._sides, self._lasts_s, self._is_turning = 0, 0.0, False
 
     @property
@@ -82,7 +83,7 @@ class Runner(mission_runner.MissionRunner):
         return self._drive == STILL
 
     def status(self) -> topics.MissionStatus:
-        state, at = self.mission.state, self._loop.clock
+        state, at = self.mission.state, self._host.clock
         now = topics.MissionStatus(seq=at.seq, t_s=at.t_s, state=state.mode, outcome=state.outcome)
         return replace(now, done=self._sides, total=SIDES)
 
@@ -129,12 +130,12 @@ class Runner(mission_runner.MissionRunner):
 
     def publish_state(self) -> None:
         if self.mission.state.mode is DONE:
-            self._loop.finish(mission_runner.EXIT_STATUS[self.mission.state.outcome])
+            self._host.finish(mission_runner.EXIT_STATUS[self.mission.state.outcome])
 
 
 @contextmanager
-def open_square(cfg: SquareConfig, _args: Any) -> Iterator[Callable[[Any], Runner]]:
-    yield lambda loop: Runner(cfg, loop)
+def open_square(cfg: SquareConfig, _args: Any) -> Iterator[Callable[[mission_runner.MissionHost], Runner]]:
+    yield lambda host: Runner(cfg, host)
 
 
 HERE = "tests.support.square"
