@@ -12,8 +12,7 @@ import zmq.asyncio
 from ccatp.clocks import MissionClock
 from ccatp.conditions import LINK_LOST, NO_FRAME_FOR, OPERATOR, text_of
 from ccatp.daemon.loops.alarm_watch import AlarmWatch
-from ccatp.daemon.loops.drives import DriveSender
-from ccatp.daemon.loops.frame_time import FrameTime, LockstepTime, RealTime
+from ccatp.daemon.loops.frame_time import DriveSender, FrameTime, LockstepTime, RealTime
 from ccatp.daemon.loops.mission_runner import STILL, LoopLimits, MissionHost, MissionRunner, TimedFrame
 from ccatp.daemon.loops.pauses import PauseWatch
 from ccatp.daemon.loops.robot_loop import RobotLoop
