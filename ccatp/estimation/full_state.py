@@ -245,7 +245,7 @@ class FullStateLocalizer(LocalizerBase):
     def _take_block(self, t_s: float, coasted: CoastedMotion | None = None) -> None:
         block = self._block.take()
         self._half_s = 0.5 * block.dt_s
-        self._estimate.journal.begin(t_s, block.dt_s)
+        self._estimate.replay_buffer.begin(t_s, block.dt_s)
         variances = self._gyro.variance, self._accelerometer.variance
         self._estimate.move(t_s, block, self._right, self._left, variances, coasted)
         mean = self._filter.mean
@@ -298,7 +298,7 @@ class FullStateLocalizer(LocalizerBase):
 
     def _use_rest(self, t_s: float) -> None:
         reading, rested_s, self._rested_s = self._rest.take(), self._rested_s, 0.0
-        self._estimate.journal.begin(t_s, 0.0)
+        self._estimate.replay_buffer.begin(t_s, 0.0)
         if reading.samples:
             self._estimate.calibrate(reading, rested_s, (self._gyro.variance, self._accelerometer.variance))
         self._predict_pose(0.0)
@@ -311,7 +311,7 @@ class FullStateLocalizer(LocalizerBase):
         Raises ``FixGated``: it contradicts the estimate, and too few others agree with it yet; ``FixRefused``: not
         finite, too old, from the future, or far from the mirror. Both leave the pose unchanged.
         """
-        foot = self._foot_of(fix, self._estimate.journal.oldest_s)
+        foot = self._foot_of(fix, self._estimate.replay_buffer.oldest_s)
         z, variance = np.array([foot.x_m, foot.y_m]), foot.covariance_m2
         before = self._running.x_m, self._running.y_m
         try:
@@ -381,7 +381,7 @@ class FullStateLocalizer(LocalizerBase):
         self._estimate.inflate_covariance(way_m, turn_rad)
         self._predict_pose(self._half_s)
         self._locate()
-        self._estimate.journal.restart()
+        self._estimate.replay_buffer.restart()
         self._block.restart()
 
     # -- time ---------------------------------------------------------------------------------------------------------
@@ -398,5 +398,5 @@ class FullStateLocalizer(LocalizerBase):
             lost_s = min(max(t_s - last_s, MAX_FRAME_STEP_S), LONGEST_GAP_S)
             self._estimate.inflate_covariance(self._running.v_m_s * lost_s, self._running.omega_rad_s * lost_s)
             self._predict_pose(0.0)
-        self._estimate.journal.restart()
+        self._estimate.replay_buffer.restart()
         self._block.restart()

@@ -32,14 +32,14 @@ _SAME_TIME_S = 1e-6
 
 
 class SurveyFilter:
-    """The filter of ``STATES`` states with its models. The ``journal`` executes each step, and replays it."""
+    """The filter of ``STATES`` states with its models. The ``replay_buffer`` executes each step, and repeats the later ones after a late fix."""
 
     def __init__(self, filter_: Filter, mirror: Mirror, cfg: Config, counts: dict[str, int], start: DeckPose) -> None:
         robot = cfg.robot
         self.innovation: Innovation | None = None
         self._turn_creep, self.turn_creep_share = TurnCreep(robot), 1.0  # in the last step
         self._cfg, self._full = cfg.localizer, cfg.localizer.full_state
-        self.journal = ReplayBuffer(filter_, self._full.rewind_s)
+        self.replay_buffer = ReplayBuffer(filter_, self._full.rewind_s)
         self._filter, self._counts = filter_, counts
         self._mirror, self.terrain = mirror, Terrain(mirror)
         self._motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
@@ -75,7 +75,7 @@ class SurveyFilter:
         return self.terrain.at(float(mean[sm.X]), float(mean[sm.Y]))
 
     def _count(self, what: str) -> None:
-        self._counts[what] += not self.journal.is_replaying
+        self._counts[what] += not self.replay_buffer.is_replaying
 
     # -- motion -------------------------------------------------------------------------------------------------------
 
@@ -119,11 +119,11 @@ class SurveyFilter:
             if rows is not None:
                 self._filter.update(rows.z, rows, rows.R)
 
-        self.journal.do(step)
+        self.replay_buffer.do(step)
         panel = self._panel_below()
         if panel != self._panel:
             self._panel = panel
-            self.journal.do(lambda: self._renew(sm.TILT, self._tilt_sigma_m))
+            self.replay_buffer.do(lambda: self._renew(sm.TILT, self._tilt_sigma_m))
 
     def _panel_below(self) -> PanelId:
         mean = self._filter.mean
@@ -159,7 +159,7 @@ class SurveyFilter:
 
     def resume(self, sigma_rad: float) -> None:
         """Count the wheel angles from zero, because samples were lost: nothing of before measures them any more."""
-        self.journal.do(lambda: self._renew(sm.ANGLES, sigma_rad))
+        self.replay_buffer.do(lambda: self._renew(sm.ANGLES, sigma_rad))
 
     def distrust_leg(self) -> None:
         """Do not use the odometry from the begin of the leg to the next fix to learn slip, creep and sensor errors."""
@@ -181,8 +181,8 @@ class SurveyFilter:
         shift[sm.PR], shift[sm.PL] = -angles[0], -angles[1]
         rebase = sm.Affine(np.eye(sm.STATES), shift)
         if full.use.zero_velocity:
-            self.journal.do(lambda: self._filter.update(np.zeros(3), _STOP_ROWS, R))
-        self.journal.do(lambda: self._filter.predict(rebase, np.zeros((sm.STATES, sm.STATES))))
+            self.replay_buffer.do(lambda: self._filter.update(np.zeros(3), _STOP_ROWS, R))
+        self.replay_buffer.do(lambda: self._filter.predict(rebase, np.zeros((sm.STATES, sm.STATES))))
 
     def calibrate(self, reading: ZeroVelocityReading, rested_s: float, imu_variances: tuple[float, float]) -> None:
         """Update biases from the inertial unit's means over a rest of ``rested_s``, and the heading from gravity."""
@@ -190,16 +190,16 @@ class SurveyFilter:
         Q = np.zeros((sm.STATES, sm.STATES))
         Q[sm.BG, sm.BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * rested_s
         Q[sm.BA, sm.BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * rested_s
-        self.journal.do(lambda: self._filter.predict(np.eye(sm.STATES), Q))
+        self.replay_buffer.do(lambda: self._filter.predict(np.eye(sm.STATES), Q))
         if full.use.rest_biases:
             H = np.zeros((2, sm.STATES))
             # v, a and w are zero since the stop, so that the scale error has no effect.
             H[0, sm.BG] = H[0, sm.W] = H[1, sm.BA] = H[1, sm.A] = 1.0
             z = np.array((reading.rate_rad_s, reading.acceleration_m_s2))
             R = np.array((imu_variances[0] / n, imu_variances[1] / n))
-            self.journal.do(lambda: self._filter.update(z, H, R))
+            self.replay_buffer.do(lambda: self._filter.update(z, H, R))
         if reading.gravity_count and full.use.gravity:
-            self.journal.do(lambda: self._update_with_gravity(reading.bearing_rad, reading.gravity_count))
+            self.replay_buffer.do(lambda: self._update_with_gravity(reading.bearing_rad, reading.gravity_count))
 
     def _update_with_gravity(self, bearing_rad: float, count: int) -> None:
         mean, full = self._filter.mean, self._full
@@ -223,8 +223,8 @@ class SurveyFilter:
         if self._full.use.slip_per_leg:
             F, b, Q = np.eye(sm.STATES), np.zeros(sm.STATES), np.zeros((sm.STATES, sm.STATES))
             F[_SLIP_BLOCK], b[sm.SLIPS], Q[_SLIP_BLOCK] = self._legs.begin(self._filter.mean, self._filter.covariance)
-            self.journal.do(lambda: self._filter.predict(sm.Affine(F, b), Q))
-        self.journal.do(self._keep_calibration)
+            self.replay_buffer.do(lambda: self._filter.predict(sm.Affine(F, b), Q))
+        self.replay_buffer.do(self._keep_calibration)
 
     def _keep_calibration(self) -> None:
         """Save the calibration at the begin and end of a leg, to restore it if the leg is found to be wrong."""
@@ -258,7 +258,7 @@ class SurveyFilter:
             if is_used:
                 filter_.update(H.dot(mean) + residual, H, np.array([variance]))
 
-        self.journal.do(step)
+        self.replay_buffer.do(step)
 
     def _renew(self, states: int | slice, sigma: float) -> None:
         """Reset states for another edge or panel: standard deviation ``sigma``, no correlations."""
@@ -283,17 +283,17 @@ class SurveyFilter:
             mean = self._filter.mean
             residual, H = fix_row(z, mean, self.slope(), late_s)
             innovation = self._filter.update(H.dot(mean) + residual, H, variance)
-            if not self.journal.is_replaying:
+            if not self.replay_buffer.is_replaying:
                 self.innovation = innovation
             self._keep_calibration()
 
-        repeated = self.journal.take(t_s, step)
+        repeated = self.replay_buffer.take(t_s, step)
         self._legs.end(self._filter.mean, self._filter.covariance)
         return repeated
 
     def expect(self, t_s: float, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residual of a position (2,) against the estimate at ``t_s``, and the covariance of the estimate (2, 2)."""
-        mean, P, late_s = self.journal.look(t_s)
+        mean, P, late_s = self.replay_buffer.look(t_s)
         residual, H = fix_row(z, mean, self.terrain.at(float(mean[sm.X]), float(mean[sm.Y])), late_s)
         return residual, H.dot(P).dot(H.T)
 
@@ -310,7 +310,7 @@ class SurveyFilter:
         self._is_trusted = True
         heading_rad2 = max(self._full.relocated_heading_sigma_rad, turn_rad) ** 2
         x, P = relocated(mean, P, residual, variance, self._tilt_sigma_m**2, heading_rad2, is_lost=is_lost)
-        self.journal.restart()
+        self.replay_buffer.restart()
         self._seams.forget()
         self._legs.forget_leg()
         self.innovation = None

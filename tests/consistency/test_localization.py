@@ -123,7 +123,7 @@ def run(name: str, seed: int) -> Run:
         rate = (1.0 + x[KG]) * x[W] + x[BG] + sqrt(gyro / SAMPLES) * rng.normal()
         jumps = accelerometer / SAMPLES + full.acceleration_jump_m_s2**2
         block = PreintegratedMotion(DT_S, DT_S, float(rate), float(x[A] + x[BA] + sqrt(jumps) * rng.normal()), SAMPLES)
-        found.journal.begin(k * DT_S, DT_S)
+        found.replay_buffer.begin(k * DT_S, DT_S)
         found.move(k * DT_S, block, right, left, (gyro, accelerometer))
         if k in FIX_STEPS:
             found.fix(k * DT_S, x[:2] + FIX_SIGMA_M * rng.normal(size=2), FIX_SIGMA_M**2 * np.eye(2))

@@ -40,22 +40,22 @@ H, R = np.array([[1.0, 0.0]]), np.array([0.04])
 
 
 class Recorded:
-    """A linear filter of two states and its journal; a step every 0.1 s."""
+    """A linear filter of two states and its replay buffer; a step every 0.1 s."""
 
     def __init__(self, reach_s: float = 10.0) -> None:
         self.filter = KalmanFilter(np.zeros(2), np.eye(2))
-        self.journal = ReplayBuffer(self.filter, reach_s)
+        self.replay_buffer = ReplayBuffer(self.filter, reach_s)
 
     def step(self, k: int) -> None:
-        self.journal.begin(0.1 * k, 0.1)
-        self.journal.do(lambda: self.filter.predict(F, Q))
-        self.journal.do(lambda: self.measure(0.3 * k, H))
+        self.replay_buffer.begin(0.1 * k, 0.1)
+        self.replay_buffer.do(lambda: self.filter.predict(F, Q))
+        self.replay_buffer.do(lambda: self.measure(0.3 * k, H))
 
     def measure(self, z: float, row: FloatArray) -> None:
         self.filter.update(np.array([z]), row, R)
 
     def late(self, t_s: float, z: float) -> int:
-        return self.journal.take(t_s, lambda _: self.measure(z, np.array([[0.2, 1.0]])))
+        return self.replay_buffer.take(t_s, lambda _: self.measure(z, np.array([[0.2, 1.0]])))
 
 
 def same(one: Recorded, other: Recorded) -> None:
@@ -226,14 +226,14 @@ def test_a_standstill_however_long_does_not_grow_and_takes_a_measurement_of_its_
     stood_s, z = 0.1 * walked, 0.7
     row = np.array([[0.0, 1.0]])
     for k in range(1000):
-        recorded.journal.begin(stood_s + 0.1 * (k + 1), 0.0)
-        recorded.journal.do(partial(recorded.measure, 0.0, row))
-        kept = sum(len(entry.steps) for entry in recorded.journal._entries)
+        recorded.replay_buffer.begin(stood_s + 0.1 * (k + 1), 0.0)
+        recorded.replay_buffer.do(partial(recorded.measure, 0.0, row))
+        kept = sum(len(entry.steps) for entry in recorded.replay_buffer._entries)
         assert kept <= 2 * walked + reach_s / 0.1 + 1
-    assert len(recorded.journal._entries) == 2
+    assert len(recorded.replay_buffer._entries) == 2
     # Taken in the standstill or at its first instant, it is a measurement of today's state.
     for t_s in (stood_s + 0.05, stood_s):
-        assert recorded.journal.oldest_s <= t_s
+        assert recorded.replay_buffer.oldest_s <= t_s
         today = Recorded()
         today.filter.reset(recorded.filter.mean, recorded.filter.covariance)
         today.measure(z, np.array([[0.2, 1.0]]))
