@@ -32,7 +32,10 @@ _SAME_TIME_S = 1e-6
 
 
 class SurveyFilter:
-    """The filter of ``STATES`` states with its models. The ``replay_buffer`` executes each step, and repeats the later ones after a late fix."""
+    """The filter of ``STATES`` states with its models.
+
+    ``replay_buffer`` executes each step, and repeats the later ones after a late fix.
+    """
 
     def __init__(self, filter_: Filter, mirror: Mirror, cfg: Config, counts: dict[str, int], start: DeckPose) -> None:
         robot = cfg.robot
