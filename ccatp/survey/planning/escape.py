@@ -75,12 +75,12 @@ def _swept(at_turn: FloatArray) -> FloatArray:
     return np.concatenate((right[:0:-1], left))
 
 
-_RETREAT_M = np.r_[20:100:5, 100:301:10] * 1e-3
+_AWAY_M = np.r_[20:100:5, 100:301:10] * 1e-3
 _SLANTS_RAD = np.radians([0, 2, -2, 4, -4, 6, -6, 8, -8, 10, -10, 12, -12, 14, -14])
 _COURSES_RAD = np.radians([0, 90, 180, 270])[:, None] + _SLANTS_RAD  # (sides, slants)
 
 
-def find_retreats(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
+def find_turning_places(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
     """For each place where the robot cannot turn freely, the nearest places around it where it can; else none.
 
     At most one in each direction of the grid of panels, straight or slightly slanted (for a place in a corner, or to
@@ -90,23 +90,23 @@ def find_retreats(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tu
     x0 = np.array([places[k].x_m for k in near]).reshape(-1, 1, 1, 1)
     y0 = np.array([places[k].y_m for k in near]).reshape(-1, 1, 1, 1)
     depths = mirror.rim.signed_distances_m(
-        x0 + _RETREAT_M * np.cos(_COURSES_RAD)[..., None], y0 + _RETREAT_M * np.sin(_COURSES_RAD)[..., None]
+        x0 + _AWAY_M * np.cos(_COURSES_RAD)[..., None], y0 + _AWAY_M * np.sin(_COURSES_RAD)[..., None]
     )
     found: list[tuple[LegPlace, ...]] = [()] * len(places)
     for k, sides in zip(near, depths, strict=True):
         nearest = [_nearest(places[k], body, *side) for side in zip(sides, _COURSES_RAD, strict=True)]
-        found[k] = tuple(retreat for retreat in nearest if retreat is not None)
+        found[k] = tuple(place for place in nearest if place is not None)
     return found
 
 
 def _nearest(place: LegPlace, body: Body, depths: FloatArray, courses_rad: FloatArray) -> LegPlace | None:
     faced = np.array([place.can_face(course) or place.can_face(course + pi) for course in courses_rad.tolist()])
-    is_good = (depths >= body.turning_depth_m) & faced[:, None] & (body.shortest_retreat_m <= _RETREAT_M)
+    is_good = (depths >= body.turning_depth_m) & faced[:, None] & (body.shortest_move_m <= _AWAY_M)
     if not is_good.any():
         return None
     step = int(np.argmax(is_good.any(axis=0)))
     slant = int(np.argmax(is_good[:, step]))
-    distance_m, course = float(_RETREAT_M[step]), float(courses_rad[slant])
+    distance_m, course = float(_AWAY_M[step]), float(courses_rad[slant])
     return LegPlace(
         place.x_m + distance_m * cos(course), place.y_m + distance_m * sin(course), float(depths[slant, step])
     )

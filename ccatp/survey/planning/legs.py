@@ -29,8 +29,8 @@ _AMBIGUOUS_RAD = 0.1
 _SPARE_M = 0.001
 # On a shorter leg the error of the position dominates the steering: 1 mm on 20 mm is the 0.05 rad that needs no turn.
 # The turn before the leg adds an error proportional to the friction lever of the tyres.
-_RETREAT_M = 0.02
-_RETREAT_TYRES = 8.0
+_SHORTEST_MOVE_M = 0.02
+_SHORTEST_MOVE_TYRES = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,14 +71,14 @@ class LegPlace:
 class Body(NamedTuple):
     """The edge sensors in the robot frame, (4, 2), the distance of the furthest, and the clearances, m.
 
-    ``shortest_retreat_m``: least length of the leg from the place of the turn to a point at the rim.
+    ``shortest_move_m``: least length of the leg from the place of the turn to a point at the rim.
     """
 
     sensors_m: FloatArray
     reach_m: float
     leg_clearance_m: float
     turn_clearance_m: float
-    shortest_retreat_m: float
+    shortest_move_m: float
 
     @property
     def turning_depth_m(self) -> float:
@@ -89,7 +89,7 @@ class Body(NamedTuple):
 def build_body(robot: RobotConfig, mission: MissionConfig) -> Body:
     """The robot's body and clearances from the configuration."""
     reach_m = max(hypot(x, y) for x, y in robot.edge_sensors_m)
-    shortest_m = max(_RETREAT_M, _RETREAT_TYRES * robot.tyre_m)
+    shortest_m = max(_SHORTEST_MOVE_M, _SHORTEST_MOVE_TYRES * robot.tyre_m)
     sensors_m = np.array(robot.edge_sensors_m)
     return Body(sensors_m, reach_m, mission.leg_clearance_m, mission.turn_clearance_m, shortest_m)
 

@@ -12,7 +12,7 @@ from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
 from ccatp.kinematics import difference
 from ccatp.mirror.layout import POINTS_PER_ROW
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.planning.escape import find_escape, find_retreats, plan_calibration
+from ccatp.survey.planning.escape import find_escape, find_turning_places, plan_calibration
 from ccatp.survey.planning.legs import (
     LegPlace,
     LegRules,
@@ -102,7 +102,7 @@ class RoutePlanner:
         base = base or self._mirror.base_pose
         places, first = self._places(start, [(base.x_m, base.y_m)])
         goal, course = places[1], course_of_heading(self._mirror, base)
-        arrivals = self._search.advance([first], (), goal, self._retreats(places)[1])
+        arrivals = self._search.advance([first], (), goal, self._turning_places(places)[1])
         if not arrivals:
             raise self._unreachable(f"base at ({base.x_m:.3f}, {base.y_m:.3f}) m", goal)
 
@@ -127,9 +127,9 @@ class RoutePlanner:
         first = SearchNode(places[0], course_of_heading(mirror, start), 0.0)
         return places, first if places[0].blocked is None else find_escape(mirror, body, first, self._limits)
 
-    def _retreats(self, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
+    def _turning_places(self, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
         """Places to turn near each place; none for the start, which has its escape from the rim."""
-        return [(), *find_retreats(self._mirror, self._body, places[1:])]
+        return [(), *find_turning_places(self._mirror, self._body, places[1:])]
 
     def _unreachable(self, what: str, place: LegPlace) -> UnreachablePointError:
         mission = self._mission
@@ -140,10 +140,10 @@ class RoutePlanner:
 
     def _stops(self, points: list[PointId], start: DeckPose, out_of_reach: list[PointId] | None) -> tuple[Stop, ...]:
         places, first = self._places(start, [self._mirror.point_on_deck(point) for point in points])
-        retreats = self._retreats(places)
+        turning_places = self._turning_places(places)
         arrivals, before = [first], 0
         for k, point in enumerate(points, start=1):
-            found = self._search.advance(arrivals, retreats[before], places[k], retreats[k])
+            found = self._search.advance(arrivals, turning_places[before], places[k], turning_places[k])
             if found:
                 arrivals, before = found, k
             elif out_of_reach is not None:

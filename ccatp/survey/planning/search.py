@@ -104,8 +104,8 @@ Frontier = dict[LegPlace, list[SearchNode]]
 class Search:
     """Finds the way through targets in their order, each leg forward or in reverse.
 
-    Between two targets the robot may drive straight, or turn at a retreat of the first, the second or both. It drives
-    around stepped corners.
+    Between two targets the robot may drive straight, or turn at a turning place of the first, the second or both. It
+    drives around stepped corners.
     """
 
     def __init__(self, rules: LegRules, limits: LimitsConfig) -> None:
@@ -114,22 +114,22 @@ class Search:
     def advance(
         self,
         arrivals: Sequence[SearchNode],
-        retreats: tuple[LegPlace, ...],
+        turning_places: tuple[LegPlace, ...],
         target: LegPlace,
-        target_retreats: tuple[LegPlace, ...] = (),
+        target_turning_places: tuple[LegPlace, ...] = (),
     ) -> list[SearchNode]:
         """Arrivals at the next target over the places to turn near either end; empty if there is no way."""
         here = arrivals[0].place
         frontier: Frontier = {here: list(arrivals)}
-        frontier |= self._extend(frontier, retreats)
-        elbows = self._rules.elbows(frontier, (target, *target_retreats))
+        frontier |= self._extend(frontier, turning_places)
+        elbows = self._rules.elbows(frontier, (target, *target_turning_places))
         frontier = _merged(frontier, self._extend(frontier, elbows))
         around = frontier
         for corner in self._rules.way_around(here, target):
             around = self._extend(around, (corner,))
         if around is not frontier:
             frontier = _merged(frontier, around)
-        frontier = _merged(frontier, self._extend(frontier, target_retreats))
+        frontier = _merged(frontier, self._extend(frontier, target_turning_places))
         return self._extend(frontier, (target,)).get(target, [])
 
     def _extend(self, frontier: Frontier, targets: Iterable[LegPlace]) -> Frontier:

@@ -12,7 +12,7 @@ from ccatp.config.models import LimitsConfig
 from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.kinematics import bearing, difference
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.planning.escape import find_retreats
+from ccatp.survey.planning.escape import find_turning_places
 from ccatp.survey.planning.legs import (
     Body,
     LegPlace,
@@ -72,30 +72,30 @@ def test_half_a_turn_needs_room_on_both_sides() -> None:
     assert not stance.can_turn(0.0, pi)
 
 
-def test_retreats_allow_turning_and_are_straight_moves_the_place_allows(world: Any) -> None:
+def test_places_to_turn_allow_turning_and_are_straight_moves_the_place_allows(world: Any) -> None:
     mirror, body = world.mirror, body_of(world)
     points = [point for panel in mirror.panels for point in mirror.point_ids(panel)]
     xy = np.array([mirror.point_on_deck(point) for point in points])
     places = build_places(mirror, body, xy[:, 0], xy[:, 1])
-    retreats = find_retreats(mirror, body, places)
-    assert len(retreats) == len(points)
-    for spot, around in zip(places, retreats, strict=True):
+    turning_places = find_turning_places(mirror, body, places)
+    assert len(turning_places) == len(points)
+    for spot, around in zip(places, turning_places, strict=True):
         assert bool(around) == (spot.blocked is not None)
-        for retreat in around:
-            dx, dy = retreat.x_m - spot.x_m, retreat.y_m - spot.y_m
+        for turning_place in around:
+            dx, dy = turning_place.x_m - spot.x_m, turning_place.y_m - spot.y_m
             assert 0.0199 < hypot(dx, dy) < 0.301
-            assert retreat.depth_m >= body.turning_depth_m
+            assert turning_place.depth_m >= body.turning_depth_m
             course = float(np.arctan2(dy, dx))
             assert spot.can_face(course) or spot.can_face(course + pi)
 
 
-def test_on_tyres_that_creep_a_retreat_is_longer(thesis: Any) -> None:
+def test_on_tyres_that_creep_a_place_to_turn_is_further_away(thesis: Any) -> None:
     shortest_m = []
     for tyre_m in (0.002, 0.0075):
         robot = thesis.cfg.robot.model_copy(update={"tyre_m": tyre_m})
         mirror, body = thesis.mirror, build_body(robot, thesis.cfg.mission)
         spot = at(mirror, body, PointId(5, 11, 6))
-        moves = find_retreats(mirror, body, [spot])[0]
+        moves = find_turning_places(mirror, body, [spot])[0]
         shortest_m.append(min(hypot(r.x_m - spot.x_m, r.y_m - spot.y_m) for r in moves))
     assert shortest_m == pytest.approx([0.02, 0.06], abs=1e-9)  # eight times the lever at which they rub
 
