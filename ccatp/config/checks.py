@@ -10,7 +10,7 @@ from typing import Protocol
 
 from pydantic import BaseModel
 
-from ccatp.config.messages import ConfigProblem, Key, choice_hint, slip_hint
+from ccatp.config.messages import ConfigProblem, Key, choice_hint, unit_hint
 from ccatp.config.models import Config, DashboardConfig, MirrorConfig
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.config.robot_limits import TOP_SPEED_M_S
@@ -48,9 +48,9 @@ def check_config(cfg: Config) -> Problems:
     # Lengths and angles that have no limit of their own, but that cannot be meant.
     for name, value in cfg:
         if name != "mirror":
-            yield from _slips(value, (name,))
-    yield from _slips(cfg.mirror.frame, ("mirror", "frame"))
-    yield from _slips(cfg.mirror.base, ("mirror", "base"))
+            yield from _unit_mistakes(value, (name,))
+    yield from _unit_mistakes(cfg.mirror.frame, ("mirror", "frame"))
+    yield from _unit_mistakes(cfg.mirror.base, ("mirror", "base"))
     yield from _check_wheels(cfg)
     yield from _check_world(cfg)
     yield from _check_network(cfg)
@@ -101,7 +101,7 @@ def _check_run(cfg: Config) -> Problems:
             yield problem_of(f"align.light.{name}.direction_world", "= [0, 0, 0] is no direction")
 
 
-def _slips(value: object, key: Key) -> Problems:
+def _unit_mistakes(value: object, key: Key) -> Problems:
     items: Iterable[tuple[str | int, object]] = ()
     if isinstance(value, BaseModel):
         items = value
@@ -113,9 +113,9 @@ def _slips(value: object, key: Key) -> Problems:
         name = next(part for part in reversed(key) if isinstance(part, str))
         largest = {"rad": 2.0 * math.pi, "m": _LARGEST_LENGTH_M}.get(name.rsplit("_", 1)[-1], math.inf)
         if abs(value) > largest:
-            yield ConfigProblem(key, f"= {value:g} must be at most {largest:.4g}{slip_hint(key, value)}")
+            yield ConfigProblem(key, f"= {value:g} must be at most {largest:.4g}{unit_hint(key, value)}")
     for part, item in items:
-        yield from _slips(item, (*key, part))
+        yield from _unit_mistakes(item, (*key, part))
 
 
 def check_onboard_config(cfg: OnboardConfig) -> Problems:

@@ -18,7 +18,7 @@ Key = tuple[str | int, ...]
 
 _DEGREE = math.pi / 180.0
 # Suffix of a key, factor from the unit that people write by mistake, that unit, the right one. Longest suffix first.
-UNIT_SLIPS = (
+UNIT_MISTAKES = (
     ("_rad_s2", _DEGREE, "deg/s2", "rad/s2"),
     ("_m_s2", 1e-3, "mm/s2", "m/s2"),
     ("_rad_s", _DEGREE, "deg/s", "rad/s"),
@@ -124,10 +124,10 @@ def choice_hint(name: str, names: Iterable[str]) -> str:
     return f"{meant}available: {', '.join(names) or 'none'}"
 
 
-def slip_hint(key: Key, value: float, limit: float = math.inf) -> str:
+def unit_hint(key: Key, value: float, limit: float = math.inf) -> str:
     """``; looks like millimetres: write 0.03`` when the value in the usual wrong unit lies within ``limit``."""
     name = next((part for part in reversed(key) if isinstance(part, str)), "")
-    for suffix, factor, wrong, right in UNIT_SLIPS:
+    for suffix, factor, wrong, right in UNIT_MISTAKES:
         if name.endswith(suffix):
             fits = abs(value) * factor <= limit
             return f"; looks like {wrong}: {value:g} {wrong} are {value * factor:.6g} {right}".rstrip() if fits else ""
@@ -151,7 +151,7 @@ def _what(error: Mapping[str, Any], root: type[BaseModel]) -> str:
         near = nearest(value, re.findall("'([^']*)'", limits["expected"]))
         hint = f"; did you mean {near}?" if near else ""
     elif kind in {"less_than", "less_than_equal"}:
-        hint = slip_hint(key, value, limits.get("lt", limits.get("le")))
+        hint = unit_hint(key, value, limits.get("lt", limits.get("le")))
     # pydantic's words: Input should be a valid number; Tuple should have at least 4 items after validation, not 3
     must = re.sub(r"^\w+ should", "must", error["msg"]).replace(" after validation", "")
     must = "must be a section" if kind in {"model_type", "dict_type"} else must
