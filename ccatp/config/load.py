@@ -49,8 +49,8 @@ _SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
     "mirror": ("mirrors", MirrorConfig),
     "world": ("worlds", WorldConfig),
 }
-# Keys of surveys that have another place now: files and recordings of before are read as they were meant.
-_MOVED = {
+# Keys that have another place or name now: files and recordings of before are read as they were meant.
+_MOVED = {("robot", "slip_after_s"): ("robot", "late_after_s")} | {
     ("localizer", name): ("localizer", "four_state", name)
     for name in (
         *("jerk_density_m2_s5", "angular_acceleration_density_rad2_s3", "slip_fraction"),
@@ -121,7 +121,7 @@ def merged(
 
 
 def layers(base: str, file: Path | None, overrides: Overrides, *, any_ports: bool = False) -> list[ConfigSource]:
-    """Command line, the user's file, base: the strongest first."""
+    """Command line, the user's file, base: the strongest first, with keys of older versions at their present places."""
     user = read_source(file) if file else ConfigSource("", "", {})
     if file is not None:
         _check_whole(file, user)
@@ -130,7 +130,7 @@ def layers(base: str, file: Path | None, overrides: Overrides, *, any_ports: boo
     for server in below.tree["sim"].values() if any_ports else ():
         if isinstance(server, dict) and "port" in server:
             server["port"] = 0
-    return [command, user, below]
+    return [replace(source, tree=_with_moved_keys(source.tree)) for source in (command, user, below)]
 
 
 def _check_whole(file: Path, source: ConfigSource) -> None:
@@ -220,8 +220,7 @@ def load_config(file: Path | None = None, overrides: Overrides = None, *, any_po
     ``any_ports``: the simulated servers take any free port unless file or overrides name one. ConfigError: one line
     with file, line, key, what is wrong and what to do; NotASurvey: the file is of another kind of mission.
     """
-    given = layers(DEFAULT_FILE, file, overrides, any_ports=any_ports)
-    command, user, base = sources = [replace(source, tree=_with_moved_keys(source.tree)) for source in given]
+    command, user, base = sources = layers(DEFAULT_FILE, file, overrides, any_ports=any_ports)
     system = user.tree.pop("system", SURVEY)
     if file is not None and system != SURVEY:
         kind = find_kind(system)

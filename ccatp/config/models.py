@@ -79,7 +79,7 @@ class LinkConfig(Model):
     key_file: Text
     connect_timeout_s: Positive
     sensors_timeout_s: Freshness
-    slip_after_s: Positive
+    late_after_s: Positive
     lag_limit_s: Freshness
     silence_timeout_s: Positive
     reconnect_timeout_s: Positive

@@ -99,7 +99,7 @@ def test_nothing_grows(start: Start, measured: Measured) -> None:
                 memory_mib = process.memory_info().rss / MIB
                 rows[name].append((time.monotonic() - begun_s, memory_mib, process.num_fds(), process.num_threads()))
         time.sleep(1.0)
-    slips = run.ask("status")["status"]["missed_deadlines"]
+    missed = run.ask("status")["status"]["missed_deadlines"]
     run.end()
     for name, table in rows.items():
         times_s, memory_mib, descriptors, threads = np.array(table).T
@@ -115,4 +115,4 @@ def test_nothing_grows(start: Start, measured: Measured) -> None:
     log = (run.run_dir / "log.jsonl").read_text()
     assert "never retrieved" not in run.stderr + log
     assert "Traceback" not in run.stderr
-    assert isinstance(slips, int)  # told, however many they are
+    assert isinstance(missed, int)  # told, however many they are

@@ -78,7 +78,7 @@ class RobotLoop:
         self.log = open_log(args.run_dir / "log.jsonl", name)
         self.publisher = Publisher(context, args.endpoints.of(name))
         self.heartbeat = HeartbeatPublisher(self.publisher, name)
-        self.lateness = LatenessStatistics(args.config.robot.slip_after_s)
+        self.lateness = LatenessStatistics(args.config.robot.late_after_s)
         self.over = asyncio.Event()
         handler = SessionHandler(
             on_sensors=work.on_sensors,

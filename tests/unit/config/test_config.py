@@ -3,6 +3,7 @@
 import json
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from ccatp.config.describe import comments, differences, json_schema, template
 from ccatp.config.files import write_file
 from ccatp.config.load import available, dump_config, kind_in, load_config, load_mission, with_values
 from ccatp.config.messages import find_line
+from ccatp.config.mission import MissionConfig
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
@@ -572,3 +574,15 @@ def test_keys_that_have_moved_mean_what_they_meant(tmp_path: Path) -> None:
     file.write_text("[localizer]\nslip_fraction = -1.0\n")
     with pytest.raises(ConfigError, match=r"telescope\.toml:1: localizer\.four_state\.slip_fraction = -1\.0 must be"):
         load_config(file)
+
+
+@pytest.mark.parametrize("load", [load_config, load_radio_config])
+def test_the_time_after_which_a_frame_is_late_has_been_named_after_a_slip(
+    load: Callable[..., MissionConfig], tmp_path: Path
+) -> None:
+    file = tmp_path / "old.toml"
+    file.write_text("[robot]\nslip_after_s = 0.03\n")
+    assert load(file).robot.late_after_s == 0.03
+    assert load(None, {"robot.slip_after_s": 0.04}).robot.late_after_s == 0.04
+    file.write_text("[robot]\nslip_after_s = 0.03\nlate_after_s = 0.05\n")
+    assert load(file).robot.late_after_s == 0.05
