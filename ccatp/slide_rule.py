@@ -7,7 +7,7 @@ properties distinguish them from a slide: a slide consists of many samples, and 
 
 from ccatp.core import Vector2
 
-_LEAST_SHARE = 0.3  # least part of the slip limit, because a difference in turning alone is no slide
+_LEAST_SHARE = 0.3  # least part of the limit of the slide, because a difference in turning alone is no slide
 _LARGEST_M_S2 = 10.0  # gravity cannot cause a larger acceleration
 _CONTACT_M_S2 = 2.0  # a single larger difference that its neighbours do not take back is a contact
 _FORGOTTEN_S = 20.0  # legs and turns, which differ in noise, alternate within this time
@@ -41,7 +41,7 @@ class SlideRule:
     """Detects loss of grip: the body moves downhill faster than its wheels.
 
     The differences between body and wheels in speed and in angle are summed with a memory of 60 ms, and compared with
-    the limits ``slip_m_s`` and ``turn_rad``. The larger the difference in angle, the smaller the slip that is allowed.
+    the limits ``slide_m_s`` and ``turn_rad``. The larger the difference in angle, the smaller this limit.
 
     After ``CONTACTS`` contacts the accelerometer is treated as one of single differences: no sample counts more than
     2 m/s^2, and noise may raise the limit, ``limit_m_s``. No body slides uphill, so the sum uphill is noise.
@@ -53,8 +53,8 @@ class SlideRule:
     CONTACTS = 5.0  # within about 20 s; on flat tyres means over 10 ms show at most 6, single differences 48 and more
     BIAS_SAMPLES = 50  # accelerometer samples at rest whose mean is its bias
 
-    def __init__(self, slip_m_s: float, turn_rad: float) -> None:
-        self.slip_m_s, self._turn_rad = slip_m_s, turn_rad
+    def __init__(self, slide_m_s: float, turn_rad: float) -> None:
+        self.slide_m_s, self._turn_rad = slide_m_s, turn_rad
         self._ahead_m_s = self._left_m_s = self._turned_rad = 0.0
         self._since_slide_s = _AFTER_SLIDE_S
         self._ahead, self._left = ContactCounter(), ContactCounter()
@@ -72,8 +72,8 @@ class SlideRule:
 
     @property
     def limit_m_s(self) -> float:
-        """The present limit of the slip."""
-        return max(self.slip_m_s, self._noise_m_s) if self.shows_contacts else self.slip_m_s
+        """The present limit of the slide."""
+        return max(self.slide_m_s, self._noise_m_s) if self.shows_contacts else self.slide_m_s
 
     def is_possible(self, acceleration_m_s2: float) -> bool:
         """Whether gravity, or a contact in a single difference, can cause an acceleration."""

@@ -50,7 +50,11 @@ _SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
     "world": ("worlds", WorldConfig),
 }
 # Keys that have another place or name now: files and recordings of before are read as they were meant.
-_MOVED = {("robot", "slip_after_s"): ("robot", "late_after_s")} | {
+_MOVED = {
+    ("robot", "slip_after_s"): ("robot", "late_after_s"),
+    ("health", "grip_slip_m_s"): ("health", "grip_slide_m_s"),
+    ("robot", "grip_slip_m_s"): ("robot", "grip_slide_m_s"),  # of the on-board program
+} | {
     ("localizer", name): ("localizer", "four_state", name)
     for name in (
         *("jerk_density_m2_s5", "angular_acceleration_density_rad2_s3", "slip_fraction"),

@@ -32,7 +32,7 @@ class OnboardRobotConfig(Model):
     puck_m: tuple[float, float, float]
     max_wheel_rad_s: Positive
     fan_floor: Fraction
-    grip_slip_m_s: Positive
+    grip_slide_m_s: Positive
     grip_turn_rad: Positive
 
 

@@ -83,7 +83,7 @@ class OnboardRobot(LinkedRobot):
         self._rad_per_count = 2.0 * pi / cfg.servo.counts_per_rev
         self._last_counts: tuple[float, int | None, int | None] | None = None
         self._slides = SlideMonitor(
-            (robot.grip_slip_m_s, robot.grip_turn_rad), robot.wheel_radius_m, robot.wheel_base_m
+            (robot.grip_slide_m_s, robot.grip_turn_rad), robot.wheel_radius_m, robot.wheel_base_m
         )
         self._slides_until_s = 0.0
         self.faults: dict[str, str] = {}

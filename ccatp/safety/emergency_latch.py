@@ -79,7 +79,7 @@ class EmergencyLatch:
         newest = self.newest
         if newest is None:
             return None
-        # A robot that moves in an earthquake slips. From the other emergencies it drives home.
+        # A robot that moves in an earthquake slides. From the other emergencies it drives home.
         kind = EmergencyKind.EARTHQUAKE if self.is_shaking else newest.kind
         row, cause, signal = EARTHQUAKE if self.is_shaking else EMERGENCY, cause_of(kind), f"emergency:{kind}"
         return Verdict(seq, t_s, row.code, cause, signal, 1.0, 0.0, *row.motion.permits())

@@ -25,7 +25,7 @@ class GripMonitor(Monitor):
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
         super().__init__()
-        self._slip_m_s = cfg.grip_slip_m_s
+        self._slide_m_s = cfg.grip_slide_m_s
         self._turn_rad = cfg.grip_turn_rad
         self._radius_m = robot.wheel_radius_m
         self._per_base = robot.wheel_radius_m / robot.wheel_base_m
@@ -36,7 +36,7 @@ class GripMonitor(Monitor):
     def reset(self) -> None:
         """See ``Monitor``."""
         super().reset()
-        self._rule = SlideRule(self._slip_m_s, self._turn_rad)
+        self._rule = SlideRule(self._slide_m_s, self._turn_rad)
         self.finding: conditions.MonitorFinding | None = None
         self.noise: conditions.MonitorFinding | None = None
         self._ahead = 0.0

@@ -129,7 +129,7 @@ class HealthMonitor:
         self._frames += 1
         is_sliding = self._grip.step(t_s, dt_s, imu, self._means, frame.gravity, self._imu.bias_rad_s)
         if frame.sliding:
-            is_sliding = self._grip.report(t_s, self.cfg.grip_slip_m_s)
+            is_sliding = self._grip.report(t_s, self.cfg.grip_slide_m_s)
         is_due = self._frames % _LOOK_FRAMES == 0 or is_flickering or is_gap or is_sliding
         if is_due or frame.faults or self.findings or self._imu.is_left_out:
             self._judge(t_s, frame, wheels)

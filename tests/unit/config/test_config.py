@@ -14,7 +14,15 @@ from ccatp.beacons.kind import BEACONS
 from ccatp.cli import main
 from ccatp.config.describe import comments, differences, json_schema, template
 from ccatp.config.files import write_file
-from ccatp.config.load import available, dump_config, kind_in, load_config, load_mission, with_values
+from ccatp.config.load import (
+    available,
+    dump_config,
+    kind_in,
+    load_config,
+    load_mission,
+    load_onboard_config,
+    with_values,
+)
 from ccatp.config.messages import find_line
 from ccatp.config.mission import MissionConfig
 from ccatp.config.models import Config
@@ -586,3 +594,11 @@ def test_the_time_after_which_a_frame_is_late_has_been_named_after_a_slip(
     assert load(None, {"robot.slip_after_s": 0.04}).robot.late_after_s == 0.04
     file.write_text("[robot]\nslip_after_s = 0.03\nlate_after_s = 0.05\n")
     assert load(file).robot.late_after_s == 0.05
+
+
+def test_the_limit_of_a_slide_has_been_named_after_a_slip(tmp_path: Path) -> None:
+    file = tmp_path / "old.toml"
+    file.write_text("[health]\ngrip_slip_m_s = 0.06\n")
+    assert load_config(file).health.grip_slide_m_s == 0.06
+    file.write_text("[robot]\ngrip_slip_m_s = 0.06\n")
+    assert load_onboard_config(file).robot.grip_slide_m_s == 0.06

@@ -207,9 +207,7 @@ def serve(lag: LatenessStatistics, late_s: dict[int, float], frames: int = 100, 
 
 
 @pytest.mark.parametrize(("late_s", "missed"), [({}, 0), ({20: 0.3, 21: 0.29, 22: 0.28, 40: 0.019, 60: 0.021}, 4)])
-def test_lateness_is_measured_and_missed_deadlines_are_counted(
-    late_s: dict[int, float], missed: int
-) -> None:
+def test_lateness_is_measured_and_missed_deadlines_are_counted(late_s: dict[int, float], missed: int) -> None:
     lag = LatenessStatistics(0.02)
     # 0.1 ms a frame may be the drift of the clock, since the last one that was prompt.
     assert serve(lag, late_s) == pytest.approx([late_s.get(k, 0.0) for k in range(100)], abs=4e-4)
