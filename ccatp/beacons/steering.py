@@ -6,7 +6,7 @@ from math import cos, hypot, pi
 from typing import NamedTuple
 
 from ccatp.beacons.config.models import FuzzyConfig, RadioControlConfig, VehicleConfig
-from ccatp.control.tracker import Pid, PidState
+from ccatp.control.pid import Pid, PidState
 from ccatp.kinematics import bearing, wrap_pi
 
 _Trapezoid = tuple[float, float, float, float]

@@ -11,7 +11,8 @@ from scipy.linalg import solve_continuous_are
 
 from ccatp.config.models import Config
 from ccatp.control.gate import DriveGate, Purpose
-from ccatp.control.tracker import LegLine, LegMotion, LegPhase, LegTracker, LegView, line_rate
+from ccatp.control.line import LegLine, LegView, line_rate
+from ccatp.control.tracker import LegMotion, LegPhase, LegTracker
 from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import Twist, Verdict
 from ccatp.kinematics import difference, twist_of, wheel_rates

@@ -7,7 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccatp.config.models import Config, PidConfig, RobotConfig
-from ccatp.control.tracker import Pid, PidState, Profile, ProfiledAxis, lag_feed_forward
+from ccatp.control.axis import ProfiledAxis, lag_feed_forward
+from ccatp.control.pid import Pid, PidState
+from ccatp.control.profile import Profile
 from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import Predicted, Twist
 from ccatp.kinematics import wheel_rates

@@ -11,7 +11,7 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config, PidConfig
-from ccatp.control.tracker import LegView, line_rate
+from ccatp.control.line import LegView, line_rate
 from ccatp.core import EdgeSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
