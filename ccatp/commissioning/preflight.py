@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from ccatp.conditions import SAMPLE_RATES, SENSOR_TOO_SLOW, text_of
 from ccatp.config.models import Config
-from ccatp.control.thrust import forecast_grip
+from ccatp.control.thrust import GripModel
 from ccatp.core import UNCHECKED, UNRELIABLE, Fix
 from ccatp.links.multiline import Environment
 from ccatp.links.robot_messages import Hello, Sensors
@@ -265,7 +265,7 @@ def _fans(report: RobotReport) -> PreflightResult:
     if report.mirror.overhang and min(report.cfg.robot.fan_duty) < floor:
         found = f"robot.fan_duty {min(report.cfg.robot.fan_duty):g} is below the robot's floor {floor:g}"
         return failed(found, "raise robot.fan_duty")
-    grip = forecast_grip(report.cfg.robot, report.mirror)
+    grip = GripModel(report.cfg.robot).forecast(report.mirror)
     if not grip.is_held:
         return failed(grip.text, "raise the thrust, or correct mass, thrust and friction of [robot]")
     if grip.is_short:

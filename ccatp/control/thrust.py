@@ -25,7 +25,7 @@ from ccatp.mirror.mirror import Mirror
 _RAMP_PER_S = 1.0  # of the duty
 _STEP = 0.02  # of the duty; smaller changes are not commanded
 _STOP_WAY_M = 0.03  # stopping distance at the rim that leaves two edge sensors on the mirror
-_HEADINGS_RAD = tuple(k * pi / 4.0 for k in range(8))
+HEADINGS_RAD = tuple(k * pi / 4.0 for k in range(8))
 _LEAST_TURN_RAD = 1.0  # turn between two fixes; a shorter one does not show the creep
 _LEAST_USE = 0.1  # tangential load over load of the wheels; with less the creep does not show either
 _MOST_FRICTION = 2.0
@@ -36,43 +36,18 @@ _MOST_SHARE = 0.95  # largest used part of the friction; the law diverges at 1
 _TOLERANCE = 1.8  # ratio by which the creep at the configured friction varies with slope and heading
 
 
-def least_thrust_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> float:
-    """Least thrust that holds the robot at its place and heading, or with ``turns`` at any heading, N."""
-    tangential, outward, ahead = _load_n(robot, gravity, turns=turns)
-    x_m, height_m = robot.centre_of_mass_m
-    share = 1.0 + x_m / robot.caster_m
-    grips = outward + (tangential / robot.friction + ahead * height_m / robot.caster_m) / share
-    lifts = outward + (tangential if turns else -ahead) * height_m / -x_m if x_m < 0.0 else 0.0
-    return max(grips, lifts, 0.0)
+class SlopeLoad(NamedTuple):
+    """Weight along the surface, away from it, and along it to the rear, N."""
 
-
-def turn_thrust_n(robot: RobotConfig, gravity: Vector3) -> float:
-    """Thrust for a turn, N, so that it has its margin and each wheel uses at most 0.8 of its friction at any heading.
-
-    The slope reduces the load of the higher wheel, and a centre of mass behind the axle increases its side force. The
-    worst heading has downhill behind and a little to the side.
-    """
-    tangential, outward, _ = _load_n(robot, gravity, turns=True)
-    x_m, height_m = robot.centre_of_mass_m
-    per_friction = 1.0 / (_MOST_USE * robot.friction)
-    along = per_friction + height_m / robot.caster_m
-    across = 2.0 * (abs(x_m) * per_friction + height_m) / robot.wheel_base_m
-    higher_n = outward + tangential * hypot(along, across) / (1.0 + x_m / robot.caster_m)
-    return max(robot.thrust_margin * least_thrust_n(robot, gravity, turns=True), higher_n)
-
-
-def _load_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> Vector3:
-    """Weight along the surface, away from it, and along it to the rear (with ``turns`` at the worst heading), N."""
-    x, y, z = gravity
-    weight_n = robot.mass_kg * GRAVITY_M_S2
-    tangential = weight_n * hypot(x, y)
-    return tangential, weight_n * z, tangential if turns else -weight_n * x
+    tangential_n: float
+    outward_n: float
+    to_rear_n: float
 
 
 class GripForecast(NamedTuple):
     """The place on a mirror where a turn needs most thrust: least and wanted thrust there, and full thrust, N.
 
-    ``safe_speed_m_s``: see the function; 0 where the robot cannot be held or stopped.
+    ``safe_speed_m_s``: see ``GripModel``; 0 where the robot cannot be held or stopped.
     """
 
     place: DeckPose
@@ -106,37 +81,124 @@ class GripForecast(NamedTuple):
         return found
 
 
-def forecast_grip(robot: RobotConfig, mirror: Mirror) -> GripForecast:
-    """Forecast from the robot's configuration, at the centre of the panel that needs most thrust."""
-    places = [DeckPose(panel.x_m, panel.y_m, 0.0) for panel in mirror.panels.values()]
-    needs = [(least_thrust_n(robot, mirror.gravity_in_robot(place), turns=True), place) for place in places]
-    least_n, place = max(needs, key=lambda need: need[0])
-    speed_m_s = safe_speed_m_s(robot, mirror.gravity_in_robot(place), robot.thrust_n)
-    return GripForecast(place, least_n, robot.thrust_margin * least_n, robot.thrust_n, speed_m_s)
+class GripModel:
+    """The forces on a robot on a slope: load, friction of its tyres, thrust of its fans.
+
+    ``gravity``: unit vector of the direction of fall, robot frame.
+    """
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self.robot = robot
+
+    def with_friction(self, friction: float) -> "GripModel":
+        """The model with another friction of the tyres."""
+        return GripModel(self.robot.model_copy(update={"friction": friction}))
+
+    def least_thrust_n(self, gravity: Vector3, *, turns: bool) -> float:
+        """Least thrust that holds the robot at its place and heading, or with ``turns`` at any heading, N."""
+        robot, load = self.robot, self._load(gravity, turns=turns)
+        x_m, height_m = robot.centre_of_mass_m
+        share = 1.0 + x_m / robot.caster_m
+        grips = (
+            load.outward_n + (load.tangential_n / robot.friction + load.to_rear_n * height_m / robot.caster_m) / share
+        )
+        ahead_n = load.tangential_n if turns else -load.to_rear_n
+        lifts = load.outward_n + ahead_n * height_m / -x_m if x_m < 0.0 else 0.0
+        return max(grips, lifts, 0.0)
+
+    def turn_thrust_n(self, gravity: Vector3) -> float:
+        """Thrust for a turn, N, so that it has its margin and each wheel uses at most 0.8 of its friction at any heading.
+
+        The slope reduces the load of the higher wheel, and a centre of mass behind the axle increases its side force.
+        The worst heading has downhill behind and a little to the side.
+        """
+        robot, load = self.robot, self._load(gravity, turns=True)
+        x_m, height_m = robot.centre_of_mass_m
+        per_friction = 1.0 / (_MOST_USE * robot.friction)
+        along = per_friction + height_m / robot.caster_m
+        across = 2.0 * (abs(x_m) * per_friction + height_m) / robot.wheel_base_m
+        higher_n = load.outward_n + load.tangential_n * hypot(along, across) / (1.0 + x_m / robot.caster_m)
+        return max(robot.thrust_margin * self.least_thrust_n(gravity, turns=True), higher_n)
+
+    def forecast(self, mirror: Mirror) -> GripForecast:
+        """Forecast from the robot's configuration, at the centre of the panel that needs most thrust."""
+        robot = self.robot
+        places = [DeckPose(panel.x_m, panel.y_m, 0.0) for panel in mirror.panels.values()]
+        needs = [(self.least_thrust_n(mirror.gravity_in_robot(place), turns=True), place) for place in places]
+        least_n, place = max(needs, key=lambda need: need[0])
+        speed_m_s = self.safe_speed_m_s(mirror.gravity_in_robot(place), robot.thrust_n)
+        return GripForecast(place, least_n, robot.thrust_margin * least_n, robot.thrust_n, speed_m_s)
+
+    def safe_speed_m_s(self, gravity: Vector3, thrust_n: float) -> float:
+        """Speed from which the robot stops within 30 mm by the grip that the slope leaves; 0: it cannot stop."""
+        load = self._load(gravity, turns=True)
+        wheels_n = self._wheels_n(thrust_n - load.outward_n, load.to_rear_n)
+        spare_n = self.robot.friction * wheels_n - load.tangential_n
+        return sqrt(2.0 * max(spare_n, 0.0) / self.robot.mass_kg * _STOP_WAY_M)
+
+    def used_friction(self, gravity: Vector3, thrust_n: float, headings_rad: Sequence[float]) -> list[float]:
+        """Load along the surface over load of the wheels, by the angle of downhill from behind; < 0: the wheels lift."""
+        load = self._load(gravity, turns=True)
+        pressed_n, tangential_n = thrust_n - load.outward_n, load.tangential_n
+        loads_n = [self._wheels_n(pressed_n, tangential_n * cos(to_rear)) for to_rear in headings_rad]
+        return [tangential_n / load_n if load_n > 0.0 else -1.0 for load_n in loads_n]
+
+    def friction_by_creep(self, gravity: Vector3, thrust_n: float, creep_m_rad: float) -> float | None:
+        """Friction of tyres that creep downhill by ``creep_m_rad`` per radian of a turn in place.
+
+        ``None`` on too little slope. The forces of a pivoting contact are limited by an ellipsoid, and the contact
+        slides along its normal (Howe and Cutkosky 1996): using the part u of its friction, it creeps by
+        tyre_m u / sqrt(1 - u^2) per radian. Mean over all headings.
+        """
+        robot, used = self.robot, self.used_friction(gravity, thrust_n, HEADINGS_RAD)
+        if min(used) < 0.0:
+            return None
+
+        def excess_m_rad(friction: float) -> float:
+            creeps = (robot.tyre_m * use / sqrt(friction * friction - use * use) for use in used)
+            return sum(creeps) / len(used) - creep_m_rad
+
+        least = 1.001 * max(used)  # the robot did not slide
+        if not _LEAST_USE < least < _MOST_FRICTION or robot.tyre_m == 0.0:
+            return None
+        if excess_m_rad(_MOST_FRICTION) > 0.0:
+            return _MOST_FRICTION
+        return float(brentq(excess_m_rad, least, _MOST_FRICTION)) if excess_m_rad(least) > 0.0 else least
+
+    def _load(self, gravity: Vector3, *, turns: bool) -> SlopeLoad:
+        """With ``turns``: at the worst heading, with downhill behind."""
+        x, y, z = gravity
+        weight_n = self.robot.mass_kg * GRAVITY_M_S2
+        tangential_n = weight_n * hypot(x, y)
+        return SlopeLoad(tangential_n, weight_n * z, tangential_n if turns else -weight_n * x)
+
+    def _wheels_n(self, pressed_n: float, to_rear_n: float) -> float:
+        """Load of both wheels, N."""
+        x_m, height_m = self.robot.centre_of_mass_m
+        return pressed_n * (1.0 + x_m / self.robot.caster_m) - to_rear_n * height_m / self.robot.caster_m
 
 
-def safe_speed_m_s(robot: RobotConfig, gravity: Vector3, thrust_n: float) -> float:
-    """Speed from which the robot stops within 30 mm by the grip that the slope leaves; 0: it cannot stop."""
-    tangential, outward, to_rear = _load_n(robot, gravity, turns=True)
-    spare_n = robot.friction * _wheels_n(robot, thrust_n - outward, to_rear) - tangential
-    return sqrt(2.0 * max(spare_n, 0.0) / robot.mass_kg * _STOP_WAY_M)
+class _CreepLaw(NamedTuple):
+    """Friction over used friction with downhill to the side, its increase with downhill ahead; mean creep.
 
+    The mean creep is 0 if the wheels lift.
+    """
 
-def _wheels_n(robot: RobotConfig, pressed_n: float, to_rear_n: float) -> float:
-    """Load of both wheels, N."""
-    x_m, height_m = robot.centre_of_mass_m
-    return pressed_n * (1.0 + x_m / robot.caster_m) - to_rear_n * height_m / robot.caster_m
+    level: float
+    swing: float
+    mean: float
 
 
 class TurnCreep:
-    """Creep of a turn at one heading, divided by its mean over all headings, by the law of ``friction_by_creep``.
+    """Creep of a turn at one heading, divided by its mean over all headings, by the law of
+    ``GripModel.friction_by_creep``.
 
     The thrust is that of a turn. Tyres creep as if they had 0.8 of their friction.
     """
 
     def __init__(self, robot: RobotConfig) -> None:
-        self._robot = robot
-        self._slopes: dict[tuple[int, bool], tuple[float, float, float]] = {}
+        self._grip = GripModel(robot)
+        self._slopes: dict[tuple[int, bool], _CreepLaw] = {}
 
     def share(self, gravity: Vector3) -> float:
         """Ratio at the heading with this gravity (unit vector, robot frame); 1 if the wheels lift."""
@@ -146,59 +208,25 @@ class TurnCreep:
         law = self._slopes.get(key)
         if law is None:
             law = self._slopes[key] = self._law(key[0] * _TILT_STEP, overhangs=key[1])
-        level, swing, mean = law
-        return _creep(level + swing * x / tilt) / mean if mean else 1.0
+        return _creep(law.level + law.swing * x / tilt) / law.mean if law.mean else 1.0
 
-    def _law(self, tilt: float, *, overhangs: bool) -> tuple[float, float, float]:
-        """Friction over used friction with downhill to the side, its increase with downhill ahead, and the mean creep.
-
-        The mean creep is 0 if the wheels lift. ``tilt``: sine of the angle between surface and horizontal.
-        """
-        robot, height = self._robot, sqrt(max(1.0 - tilt * tilt, 0.0))
+    def _law(self, tilt: float, *, overhangs: bool) -> _CreepLaw:
+        """``tilt``: sine of the angle between surface and horizontal."""
+        grip, robot, height = self._grip, self._grip.robot, sqrt(max(1.0 - tilt * tilt, 0.0))
         gravity = tilt, 0.0, height if overhangs else -height
-        thrust_n = min(max(turn_thrust_n(robot, gravity), 0.5 * sum(robot.fan_duty) * robot.thrust_n), robot.thrust_n)
-        aside, ahead = _used(robot, gravity, thrust_n, (0.5 * pi, pi))
-        if min(_used(robot, gravity, thrust_n, _HEADINGS_RAD)) <= 0.0:
-            return 0.0, 0.0, 0.0
+        thrust_n = min(max(grip.turn_thrust_n(gravity), 0.5 * sum(robot.fan_duty) * robot.thrust_n), robot.thrust_n)
+        aside, ahead = grip.used_friction(gravity, thrust_n, (0.5 * pi, pi))
+        if min(grip.used_friction(gravity, thrust_n, HEADINGS_RAD)) <= 0.0:
+            return _CreepLaw(0.0, 0.0, 0.0)
         level, swing = _MOST_USE * robot.friction / aside, _MOST_USE * robot.friction * (1.0 / ahead - 1.0 / aside)
-        creeps = [_creep(level - swing * cos(to_rear)) for to_rear in _HEADINGS_RAD]
-        return level, swing, sum(creeps) / len(creeps)
+        creeps = [_creep(level - swing * cos(to_rear)) for to_rear in HEADINGS_RAD]
+        return _CreepLaw(level, swing, sum(creeps) / len(creeps))
 
 
 def _creep(per_use: float) -> float:
     """The law u / sqrt(1 - u^2) for the used part u = 1 / ``per_use`` of the friction."""
     share = min(1.0 / per_use, _MOST_SHARE) if per_use > 0.0 else _MOST_SHARE
     return share / sqrt(1.0 - share * share)
-
-
-def _used(robot: RobotConfig, gravity: Vector3, thrust_n: float, headings_rad: Sequence[float]) -> list[float]:
-    """Load along the surface over load of the wheels, by the angle of downhill from behind; < 0: the wheels lift."""
-    tangential, outward, _ = _load_n(robot, gravity, turns=True)
-    loads_n = [_wheels_n(robot, thrust_n - outward, tangential * cos(to_rear)) for to_rear in headings_rad]
-    return [tangential / load_n if load_n > 0.0 else -1.0 for load_n in loads_n]
-
-
-def friction_by_creep(robot: RobotConfig, gravity: Vector3, thrust_n: float, creep_m_rad: float) -> float | None:
-    """Friction of tyres that creep downhill by ``creep_m_rad`` per radian of a turn in place; None on too little slope.
-
-    The forces of a pivoting contact are limited by an ellipsoid, and the contact slides along its normal (Howe and
-    Cutkosky 1996): using the part u of its friction, it creeps by tyre_m u / sqrt(1 - u^2) per radian. Mean over all
-    headings.
-    """
-    used = _used(robot, gravity, thrust_n, _HEADINGS_RAD)
-    if min(used) < 0.0:
-        return None
-
-    def excess_m_rad(friction: float) -> float:
-        creeps = (robot.tyre_m * use / sqrt(friction * friction - use * use) for use in used)
-        return sum(creeps) / len(used) - creep_m_rad
-
-    least = 1.001 * max(used)  # the robot did not slide
-    if not _LEAST_USE < least < _MOST_FRICTION or robot.tyre_m == 0.0:
-        return None
-    if excess_m_rad(_MOST_FRICTION) > 0.0:
-        return _MOST_FRICTION
-    return float(brentq(excess_m_rad, least, _MOST_FRICTION)) if excess_m_rad(least) > 0.0 else least
 
 
 class ThrustControl:
@@ -211,7 +239,9 @@ class ThrustControl:
     """
 
     def __init__(self, robot: RobotConfig, mirror: Mirror) -> None:
-        self._robot, self._promised, self._mirror = robot, robot.friction, mirror
+        self._grip = GripModel(robot)
+        self._configured_friction = robot.friction
+        self._mirror = mirror
         self.duty = robot.fan_duty
         self.friction = self.margin = 0.0
         self._t_s: float | None = None
@@ -221,20 +251,23 @@ class ThrustControl:
 
     def give_all(self) -> bool:
         """Full duty from now on; returns whether this is a change."""
-        is_new, self._is_full, self.duty = not self._is_full, True, (1.0, 1.0)
+        is_new = not self._is_full
+        self._is_full = True
+        self.duty = (1.0, 1.0)
         return is_new
 
     def step(self, t_s: float, pose: DeckPose, *, turns: bool) -> bool:
         """Set the duty; returns whether it has changed. ``turns``: the robot turns, or may turn at any time."""
         elapsed_s = 0.0 if self._t_s is None else t_s - self._t_s
-        robot, self._t_s = self._robot, t_s
+        grip, robot = self._grip, self._grip.robot
+        self._t_s = t_s
         self._turned_rad += abs(difference(pose.heading_rad, self._heading_rad))
         self._heading_rad = pose.heading_rad
         if self._is_full:
             return False
         gravity = self._mirror.gravity_in_robot(pose)
-        straight_n = robot.thrust_margin * least_thrust_n(robot, gravity, turns=False)
-        wanted_n = turn_thrust_n(robot, gravity) if turns else straight_n
+        straight_n = robot.thrust_margin * grip.least_thrust_n(gravity, turns=False)
+        wanted_n = grip.turn_thrust_n(gravity) if turns else straight_n
         wanted = _STEP * ceil(wanted_n / robot.thrust_n / _STEP)
         ramp = _RAMP_PER_S * min(max(elapsed_s, 0.0), 0.1)
         before = self.duty
@@ -252,18 +285,22 @@ class ThrustControl:
         """
         if fixes == self._fixes:
             return False
-        turned_rad, self._fixes, self._turned_rad = self._turned_rad, fixes, 0.0
+        turned_rad = self._turned_rad
+        self._fixes = fixes
+        self._turned_rad = 0.0
         if turned_rad < _LEAST_TURN_RAD:
             return False
         self._turns = min(self._turns + 1, _TURNS)
         self._creep_m_rad += (creep_m_rad - self._creep_m_rad) / self._turns
-        thrust_n, gravity = 0.5 * sum(self.duty) * self._robot.thrust_n, self._mirror.gravity_in_robot(pose)
-        found = friction_by_creep(self._robot, gravity, thrust_n, self._creep_m_rad)
-        at_most = friction_by_creep(self._robot, gravity, thrust_n, self._creep_m_rad / _TOLERANCE)
-        if found is None or at_most is None:
+        grip, gravity = self._grip, self._mirror.gravity_in_robot(pose)
+        thrust_n = 0.5 * sum(self.duty) * grip.robot.thrust_n
+        measured = grip.friction_by_creep(gravity, thrust_n, self._creep_m_rad)
+        largest = grip.friction_by_creep(gravity, thrust_n, self._creep_m_rad / _TOLERANCE)
+        if measured is None or largest is None:
             return False
-        self.friction, friction = found, min(at_most, self._promised)
-        if friction != self._robot.friction or not self.margin:
-            self._robot = self._robot.model_copy(update={"friction": friction})
-            self.margin = self._robot.thrust_n / forecast_grip(self._robot, self._mirror).least_n
+        self.friction = measured
+        friction = min(largest, self._configured_friction)
+        if friction != grip.robot.friction or not self.margin:
+            self._grip = grip.with_friction(friction)
+            self.margin = grip.robot.thrust_n / self._grip.forecast(self._mirror).least_n
         return True

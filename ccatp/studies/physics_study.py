@@ -17,7 +17,7 @@ import numpy as np
 from ccatp.conditions import GRIP_LOST
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.control.thrust import ThrustControl, forecast_grip
+from ccatp.control.thrust import GripModel, ThrustControl
 from ccatp.core import DeckPose, EventCode, PanelId, Twist, Verdict
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import motor_robot
@@ -43,7 +43,7 @@ def robot_keys(mirror: str, tyre: str, friction: float, margin: float | None) ->
     thrust_n = cfg.robot.thrust_n
     if margin is not None:
         # Rounded up: with less than the required margin, a survey is slow.
-        thrust_n = ceil(100.0 * margin * forecast_grip(cfg.robot, build_mirror(cfg.mirror)).least_n) / 100.0
+        thrust_n = ceil(100.0 * margin * GripModel(cfg.robot).forecast(build_mirror(cfg.mirror)).least_n) / 100.0
     for place in ("robot", "sim.physics"):
         keys |= {f"{place}.friction": friction, f"{place}.thrust_n": thrust_n}
     return keys
@@ -283,7 +283,7 @@ def stop_cells() -> Sequence[Cell]:
         keys = robot_keys(mirror, tyre, 0.6, None if thrust == "shipped" else 1.3)
         if speed == "safe":
             cfg = load_config(None, keys)
-            safe_m_s = forecast_grip(cfg.robot, build_mirror(cfg.mirror)).safe_speed_m_s
+            safe_m_s = GripModel(cfg.robot).forecast(build_mirror(cfg.mirror)).safe_speed_m_s
             keys["limits.v_max_m_s"] = min(safe_m_s, cfg.robot.max_wheel_rad_s * cfg.robot.wheel_radius_m)
         found.append(Cell({"mirror": mirror, "tyre": tyre, "thrust": thrust, "speed": speed}, keys))
     return found

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from ccatp.config.models import FOUR_STATE, Config, LimitsConfig
 from ccatp.control.gate import DriveGate
-from ccatp.control.thrust import GripForecast, ThrustControl, forecast_grip
+from ccatp.control.thrust import GripForecast, GripModel, ThrustControl
 from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.errors import ConfigError
 from ccatp.estimation.full_state import FullStateLocalizer
@@ -151,7 +151,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint
     Raises ``PlanError``: unreachable point; ``ConfigError``: too little thrust.
     """
     mirror = build_mirror(cfg.mirror)
-    grip = forecast_grip(cfg.robot, mirror)
+    grip = GripModel(cfg.robot).forecast(mirror)
     if not grip.is_held:
         raise ConfigError(f"robot.thrust_n: {grip.text}")
     cfg = _slowed(cfg, grip)
@@ -268,7 +268,7 @@ class SurveyPlan:
 
 def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
     """Plan a survey as a run would; raises ``PlanError`` if base is not on the mirror or is a dead end."""
-    grip = forecast_grip(cfg.robot, mirror)
+    grip = GripModel(cfg.robot).forecast(mirror)
     cfg = _slowed(cfg, grip)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     out_of_reach: list[PointId] = []

@@ -8,13 +8,9 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import RobotConfig
 from ccatp.control.thrust import (
+    GripModel,
     ThrustControl,
     TurnCreep,
-    forecast_grip,
-    friction_by_creep,
-    least_thrust_n,
-    safe_speed_m_s,
-    turn_thrust_n,
 )
 from ccatp.core import DeckPose, Vector3
 from ccatp.errors import ConfigError
@@ -39,29 +35,29 @@ def gravity(to_rear: float, overhang_rad: float = OVERHANG_RAD) -> Vector3:
 def test_wheels_that_carry_everything(friction: float, least_n: float) -> None:
     """Weight away from the surface and along it over the friction."""
     on_axle = robot(friction=friction, centre_of_mass_m=[0.0, 0.0])
-    assert least_thrust_n(on_axle, gravity(1.0), turns=True) == pytest.approx(least_n, abs=0.05)
+    assert GripModel(on_axle).least_thrust_n(gravity(1.0), turns=True) == pytest.approx(least_n, abs=0.05)
 
 
 def test_the_caster_takes_load_and_downhill_behind_takes_most() -> None:
     cfg = robot(friction=0.6)
     outward, along = WEIGHT_N * sin(OVERHANG_RAD), WEIGHT_N * cos(OVERHANG_RAD)
     behind = outward + (along / 0.6 + along * 0.035 / 0.075) / 0.8
-    assert least_thrust_n(cfg, gravity(0.0), turns=False) == pytest.approx(behind)
+    assert GripModel(cfg).least_thrust_n(gravity(0.0), turns=False) == pytest.approx(behind)
     for to_rear in (0.0, 1.0, pi):
-        assert least_thrust_n(cfg, gravity(to_rear), turns=True) == pytest.approx(behind)
-        assert least_thrust_n(cfg, gravity(to_rear), turns=False) <= behind
+        assert GripModel(cfg).least_thrust_n(gravity(to_rear), turns=True) == pytest.approx(behind)
+        assert GripModel(cfg).least_thrust_n(gravity(to_rear), turns=False) <= behind
     # Downhill ahead the nose goes down before the wheels slide.
-    assert least_thrust_n(cfg, gravity(pi), turns=False) == pytest.approx(outward + along * 0.035 / 0.015)
+    assert GripModel(cfg).least_thrust_n(gravity(pi), turns=False) == pytest.approx(outward + along * 0.035 / 0.015)
 
 
 def test_on_a_floor_none_is_needed() -> None:
-    assert least_thrust_n(robot(), (0.0, 0.0, -1.0), turns=True) == 0.0
+    assert GripModel(robot()).least_thrust_n((0.0, 0.0, -1.0), turns=True) == 0.0
 
 
 def test_a_turn_leaves_a_fifth_of_its_friction_to_the_lighter_wheel() -> None:
     """Loads of each wheel by moments about the axle and along it, at every heading."""
     cfg, used = robot(thrust_margin=1.0), []
-    thrust_n = turn_thrust_n(cfg, gravity(0.0))
+    thrust_n = GripModel(cfg).turn_thrust_n(gravity(0.0))
     for degrees in range(360):
         ahead, left, away = (WEIGHT_N * part for part in gravity(radians(degrees)))
         both_n = (thrust_n - away) * 0.8 + ahead * 0.035 / 0.075
@@ -73,10 +69,10 @@ def test_a_turn_leaves_a_fifth_of_its_friction_to_the_lighter_wheel() -> None:
 
 def test_speed_from_which_the_spare_grip_stops_it() -> None:
     cfg = robot(friction=0.6)
-    least_n = least_thrust_n(cfg, gravity(0.0), turns=True)
-    assert safe_speed_m_s(cfg, gravity(0.0), 0.99 * least_n) == 0.0
+    least_n = GripModel(cfg).least_thrust_n(gravity(0.0), turns=True)
+    assert GripModel(cfg).safe_speed_m_s(gravity(0.0), 0.99 * least_n) == 0.0
     # 1 N more on the fans presses the wheels with 0.8 N, of which friction takes 0.6: 0.48 m/s^2 over 30 mm.
-    assert safe_speed_m_s(cfg, gravity(0.0), least_n + 1.0) == pytest.approx((2.0 * 0.48 * 0.03) ** 0.5)
+    assert GripModel(cfg).safe_speed_m_s(gravity(0.0), least_n + 1.0) == pytest.approx((2.0 * 0.48 * 0.03) ** 0.5)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +98,7 @@ def test_duty_goes_to_what_a_turn_needs_with_a_ramp(mirror: str, thrust_n: float
 )
 def test_what_the_plan_says_of_a_slope(thrust_n: float, is_held: bool, is_short: bool, text: str) -> None:
     cfg = load_config(overrides={"run.mirror": "fyst-m2", "robot.thrust_n": thrust_n})
-    grip = forecast_grip(cfg.robot, build_mirror(cfg.mirror))
+    grip = GripModel(cfg.robot).forecast(build_mirror(cfg.mirror))
     assert (grip.is_held, grip.is_short) == (is_held, is_short)
     assert text in grip.text
 
@@ -125,11 +121,11 @@ def test_creep_of_turns_shows_the_friction(friction: float) -> None:
         use = along / load_n / friction
         found.append(0.002 * use / (1.0 - use * use) ** 0.5)
     creep_m_rad = sum(found) / len(found)
-    assert friction_by_creep(cfg, gravity(0.0), 36.0, creep_m_rad) == pytest.approx(friction, rel=0.03)
+    assert GripModel(cfg).friction_by_creep(gravity(0.0), 36.0, creep_m_rad) == pytest.approx(friction, rel=0.03)
     # No creep is no bound, and no slope or no known tyre says nothing.
-    assert friction_by_creep(cfg, gravity(0.0), 36.0, 0.0) == pytest.approx(2.0)
-    assert friction_by_creep(cfg, gravity(0.0, radians(89.0)), 36.0, creep_m_rad) is None
-    assert friction_by_creep(robot(tyre_m=0.0), gravity(0.0), 36.0, creep_m_rad) is None
+    assert GripModel(cfg).friction_by_creep(gravity(0.0), 36.0, 0.0) == pytest.approx(2.0)
+    assert GripModel(cfg).friction_by_creep(gravity(0.0, radians(89.0)), 36.0, creep_m_rad) is None
+    assert GripModel(robot(tyre_m=0.0)).friction_by_creep(gravity(0.0), 36.0, creep_m_rad) is None
 
 
 def test_a_turn_creeps_most_with_downhill_behind() -> None:
