@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from ccatp.conditions import SAMPLE_RATES, SENSOR_TOO_SLOW, text_of
 from ccatp.config.models import Config
-from ccatp.control.thrust import GripModel
+from ccatp.control.grip_model import GripModel
 from ccatp.core import UNCHECKED, UNRELIABLE, Fix
 from ccatp.links.multiline import Environment
 from ccatp.links.robot_messages import Hello, Sensors

@@ -17,7 +17,8 @@ import numpy as np
 from ccatp.conditions import GRIP_LOST
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.control.thrust import GripModel, ThrustControl
+from ccatp.control.grip_model import GripModel
+from ccatp.control.thrust import ThrustControl
 from ccatp.core import DeckPose, EventCode, PanelId, Twist, Verdict
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import motor_robot

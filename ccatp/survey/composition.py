@@ -11,7 +11,8 @@ from msgspec.structs import replace
 
 from ccatp.config.models import FOUR_STATE, Config, LimitsConfig
 from ccatp.control.gate import DriveGate
-from ccatp.control.thrust import GripForecast, GripModel, ThrustControl
+from ccatp.control.grip_model import GripForecast, GripModel
+from ccatp.control.thrust import ThrustControl
 from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.errors import ConfigError
 from ccatp.estimation.full_state import FullStateLocalizer

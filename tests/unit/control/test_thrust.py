@@ -7,11 +7,8 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.config.models import RobotConfig
-from ccatp.control.thrust import (
-    GripModel,
-    ThrustControl,
-    TurnCreep,
-)
+from ccatp.control.grip_model import GripModel
+from ccatp.control.thrust import ThrustControl, TurnCreep
 from ccatp.core import DeckPose, Vector3
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import build_mirror
