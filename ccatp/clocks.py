@@ -25,14 +25,17 @@ class SteadyTime:
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
-        self._seq, self._t_s, self._period_s = -1, 0.0, 0.0
+        self._seq = -1
+        self._t_s = 0.0
+        self._period_s = 0.0
         self.offset_s = self._before_s = 0.0
         self.jump: ClockJump | None = None
 
     def at(self, seq: int, t_s: float) -> float:
         """The steady time of the newest frame ``seq`` at robot time ``t_s``, s."""
         if self._seq < 0:
-            self._seq, self._t_s = seq, t_s
+            self._seq = seq
+            self._t_s = t_s
             return t_s
         frames, step_s = seq - self._seq, t_s - self._t_s
         expected_s = frames * self._period_s if self._period_s else step_s
@@ -42,7 +45,8 @@ class SteadyTime:
             self.jump = ClockJump(seq, step_s - expected_s)
         elif frames == 1:
             self._period_s = step_s
-        self._seq, self._t_s = seq, t_s
+        self._seq = seq
+        self._t_s = t_s
         return t_s + self.offset_s
 
     def of(self, seq: int, t_s: float) -> float:
@@ -69,10 +73,12 @@ class MissionClock:
     """
 
     def __init__(self, jump_s: float) -> None:
-        self._jump_s, self.before_s = jump_s, 0.0
+        self._jump_s = jump_s
+        self.before_s = 0.0
         self._steady = SteadyTime(jump_s)
         self._first_s: float | None = None
-        self.seq, self.t_s = -1, 0.0
+        self.seq = -1
+        self.t_s = 0.0
 
     @property
     def has_begun(self) -> bool:
@@ -94,7 +100,8 @@ class MissionClock:
         # Durations use a time that does not jump; everything else uses the robot's own time.
         before_s, steady_s = self.t_s, self.t_s
         if seq > self.seq:
-            self.seq, steady_s = seq, self._steady.at(seq, t_s)
+            self.seq = seq
+            steady_s = self._steady.at(seq, t_s)
         self.t_s = steady_s
         if self._first_s is None:
             self._first_s = steady_s
@@ -103,5 +110,7 @@ class MissionClock:
 
     def reset(self) -> None:
         """Begin again, because the robot's frame numbers and clock have restarted."""
-        self.before_s, self._first_s, self.seq = self.elapsed_s, None, -1
+        self.before_s = self.elapsed_s
+        self._first_s = None
+        self.seq = -1
         self._steady = SteadyTime(self._jump_s)

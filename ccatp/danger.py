@@ -115,9 +115,11 @@ class DangerMonitor(SafetyRules):
         edges.track.push(wheels)
         lost = self._estimate_missing(t_s, estimate)
         self._known = known = estimate if lost is None else None
-        self._frame_seq, self._state = seq, ""
+        self._frame_seq = seq
+        self._state = ""
         if known is not None:
-            self._state, self._state_seq = known.state, known.seq
+            self._state = known.state
+            self._state_seq = known.seq
             clearance.step(t_s, known, wheels)
         edges.step(samples, known)
         if samples:

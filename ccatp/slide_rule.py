@@ -26,7 +26,8 @@ class ContactCounter:
     def take(self, dt_s: float, step_m_s: float) -> None:
         """Take the difference in speed within ``dt_s``."""
         before_m_s, last_m_s = self._before_m_s, self._last_m_s
-        self._before_m_s, self._last_m_s = last_m_s, step_m_s
+        self._before_m_s = last_m_s
+        self._last_m_s = step_m_s
         self.count *= _FORGOTTEN_S / (_FORGOTTEN_S + dt_s)
         # A slide has neighbouring samples of similar size. In means over the time between two samples, a jump in speed
         # and its end cancel in neighbouring samples.
@@ -54,10 +55,12 @@ class SlideRule:
     BIAS_SAMPLES = 50  # accelerometer samples at rest whose mean is its bias
 
     def __init__(self, slide_m_s: float, turn_rad: float) -> None:
-        self.slide_m_s, self._turn_rad = slide_m_s, turn_rad
+        self.slide_m_s = slide_m_s
+        self._turn_rad = turn_rad
         self._ahead_m_s = self._left_m_s = self._turned_rad = 0.0
         self._since_slide_s = _AFTER_SLIDE_S
-        self._ahead, self._left = ContactCounter(), ContactCounter()
+        self._ahead = ContactCounter()
+        self._left = ContactCounter()
         self._noise_m_s = 0.0  # that noise may reach downhill
 
     @property

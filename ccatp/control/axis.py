@@ -41,7 +41,8 @@ class BareAxis:
 
     def __init__(self, gains: PidConfig, v_max: float, a_max: float) -> None:
         self._pid = Pid(gains, v_max)
-        self._v_max, self._a_max = v_max, a_max
+        self._v_max = v_max
+        self._a_max = a_max
 
     def begin(self, remaining: float) -> AxisState:
         """Start a motion, which has no plan: its planned time is over at once."""
@@ -70,8 +71,11 @@ class ProfiledAxis:
     """
 
     def __init__(self, gains: PidConfig, cfg: ControlConfig, v_max: float, a_max: float, lag_s: float) -> None:
-        self._kp, self._kd = gains.kp, gains.kd
-        self._v_max, self._a_max, self._lag_s = v_max, a_max, lag_s
+        self._kp = gains.kp
+        self._kd = gains.kd
+        self._v_max = v_max
+        self._a_max = a_max
+        self._lag_s = lag_s
         self._slip_gain = 1.0 / (v_max * v_max * cfg.slip_time_s)
         self._slip_limit = cfg.slip_limit
         self._feedback_limit = FEEDBACK_SHARE * v_max

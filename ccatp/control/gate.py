@@ -61,9 +61,13 @@ class DriveGate:
         self._omega_max = HEADROOM * limits.omega_max_rad_s
         self._v_step = 2.0 * HEADROOM * limits.a_max_m_s2 * wheel_lag_s
         self._omega_step = 2.0 * HEADROOM * limits.alpha_max_rad_s2 * wheel_lag_s
-        self._a, self._alpha = HEADROOM * limits.a_max_m_s2, HEADROOM * limits.alpha_max_rad_s2
-        self._radius, self._base, self._max_wheel = robot.wheel_radius_m, robot.wheel_base_m, robot.max_wheel_rad_s
-        self._verdict_timeout_s, self._frame_timeout_s = verdict_timeout_s, robot.sensors_timeout_s
+        self._a = HEADROOM * limits.a_max_m_s2
+        self._alpha = HEADROOM * limits.alpha_max_rad_s2
+        self._radius = robot.wheel_radius_m
+        self._base = robot.wheel_base_m
+        self._max_wheel = robot.max_wheel_rad_s
+        self._verdict_timeout_s = verdict_timeout_s
+        self._frame_timeout_s = robot.sensors_timeout_s
         self._last = HELD
         self.denied = dict.fromkeys(Denial, 0)
         self.denial: Denial | None = None
@@ -74,7 +78,8 @@ class DriveGate:
         """Permitted wheel rates (right, left), rad/s, for a frame at robot time ``t_s`` with age ``age_s``."""
         v, omega = wanted.v_m_s, wanted.omega_rad_s
         if v == 0.0 and omega == 0.0:
-            self._last, self.denial = HELD, None
+            self._last = HELD
+            self.denial = None
             return 0.0, 0.0
         self.denial = denial = self._judge(v, omega, verdict, dt_s, t_s, age_s, purpose)
         if denial is not None:

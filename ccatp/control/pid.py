@@ -22,7 +22,9 @@ class Pid:
     """
 
     def __init__(self, gains: PidConfig, output_limit: float) -> None:
-        self._kp, self._ki, self._kd = gains.kp, gains.ki, gains.kd
+        self._kp = gains.kp
+        self._ki = gains.ki
+        self._kd = gains.kd
         self._filter_s = gains.derivative_filter_s
         self._integral_limit = gains.integral_limit
         self._output_limit = output_limit

@@ -86,7 +86,9 @@ class ThrustControl:
         self._t_s: float | None = None
         self._is_full = False
         self._fixes = self._turns = 0
-        self._heading_rad, self._turned_rad, self._creep_m_rad = mirror.base_pose.heading_rad, 0.0, 0.0
+        self._heading_rad = mirror.base_pose.heading_rad
+        self._turned_rad = 0.0
+        self._creep_m_rad = 0.0
 
     def give_all(self) -> bool:
         """Full duty from now on; returns whether this is a change."""

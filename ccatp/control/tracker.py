@@ -69,7 +69,8 @@ class _Pace:
         self.forward: BareAxis | ProfiledAxis = self.along
         self.angular: BareAxis | ProfiledAxis = ProfiledAxis(gains.angular, control, omega, alpha, wheel_lag_s)
         if not gains.shaped:
-            self.forward, self.angular = BareAxis(gains.forward, v, a), BareAxis(gains.angular, omega, alpha)
+            self.forward = BareAxis(gains.forward, v, a)
+            self.angular = BareAxis(gains.angular, omega, alpha)
         self.steering = Pid(gains.angular, omega)
         self.omega_max = omega
 
@@ -86,7 +87,8 @@ class LegTracker:
         self, control: ControlConfig, limits: LimitsConfig, wheel_lag_s: float, slow_limits: LimitsConfig | None = None
     ) -> None:
         gains = control.gain_sets[control.gains]
-        self._control, self._shaped = control, gains.shaped
+        self._control = control
+        self._shaped = gains.shaped
         self._position_tolerance_m = gains.position_tolerance_m
         self._heading_tolerance_rad = gains.heading_tolerance_rad
         self._straight_rad = max(control.straight_tolerance_rad, gains.heading_tolerance_rad)

@@ -42,7 +42,9 @@ class SentDrives:
     """
 
     def __init__(self, robot: RobotConfig, frame_s: float) -> None:
-        self._radius_m, self._base_m, self._lag_s = robot.wheel_radius_m, robot.wheel_base_m, robot.wheel_lag_s
+        self._radius_m = robot.wheel_radius_m
+        self._base_m = robot.wheel_base_m
+        self._lag_s = robot.wheel_lag_s
         self._max_rad_s = robot.max_wheel_rad_s
         self.newest = 0
         self.rates = (0.0, 0.0)
@@ -76,7 +78,8 @@ class SentDrives:
         scale = self._max_rad_s / fastest if fastest > self._max_rad_s else 1.0  # as the robot does it
         wheels = scale * right_rad_s, scale * left_rad_s
         sent.append((seq, v_m_s, self._radius_m * (right_rad_s - left_rad_s) / self._base_m, wheels))
-        self.newest, self.rates = seq, (right_rad_s, left_rad_s)
+        self.newest = seq
+        self.rates = (right_rad_s, left_rad_s)
         if right_rad_s < self._right_low:
             self._right_low = right_rad_s
         elif right_rad_s > self._right_high:
@@ -112,7 +115,8 @@ class SentDrives:
                 if seq == echo_seq:
                     now = wheels
                     break
-        self._acting, self._was_held = now, is_held
+        self._acting = now
+        self._was_held = is_held
         if now is None or before is None or now == before or dt_s <= 0.0:
             return None if now is None else SetPoints(*now)
         off_right, off_left = now[0] - before[0], now[1] - before[1]

@@ -53,10 +53,12 @@ class FullStateLocalizer(LocalizerBase):
 
     def __init__(self, cfg: Config, mirror: Mirror, start: PanelPose, wrap: FilterWrap = unwrapped) -> None:
         super().__init__(cfg, mirror, STATES, wrap)
-        robot, self._full = cfg.robot, cfg.localizer.full_state
+        robot = cfg.robot
+        self._full = cfg.localizer.full_state
         self._rest_rate_rad_s = self._full.rest_rate_rad_s
         self._update_period_s = self._full.update_period_s - _ROUNDING_S
-        self._right, self._left = WheelAngle(), WheelAngle()
+        self._right = WheelAngle()
+        self._left = WheelAngle()
         self._gyro = NoiseFloor(cfg.localizer.gyroscope_sigma_rad_s**2)
         self._accelerometer = NoiseFloor(cfg.localizer.accelerometer_sigma_m_s2**2)
         self._rest = ZeroVelocityDetector(self._full.rest_after_s, self._gyro, self._accelerometer)
@@ -70,7 +72,9 @@ class FullStateLocalizer(LocalizerBase):
         self._fixed_m: FloatArray | None = None  # position of the last fix that was used
         self._is_relocated = False  # no fix has agreed since the last relocation
         self._creep_on: Panel | None = None
-        self._is_new_base, self._half_s, self._frame_s = False, 0.0, _NOMINAL_FRAME_S
+        self._is_new_base = False
+        self._half_s = 0.0
+        self._frame_s = _NOMINAL_FRAME_S
         self._predict_pose(0.0)
         self._locate()
 
@@ -117,6 +121,24 @@ class FullStateLocalizer(LocalizerBase):
         gravity: Gravity,
         set_points: WheelInput,
     ) -> None:
+        """See ``LocalizerBase``. What is fused, and in which order.
+
+        ::
+
+            encoders: samples? --yes--> turns of the wheels --+--> at rest? --no--> sums of the inertial unit,
+                         |                                    |       |             pose by dead reckoning
+                         no---> turns by the set points ------+      yes                     |
+                                (``_coasted``)                        |       end of block, edge, stop, or gap?
+                                                                      |                      |
+                                  each 100 samples (``_use_rest``):   |             yes: ``_end_block``
+                                    biases by the inertial unit   <---+               1. predict; wheels, inertial unit
+                                    heading by gravity                                2. each edge, by the seam there
+                                                                                      3. at a stop: zero velocity
+                                                                                      4. pose from the filter
+
+        A fix is for a time in the past, and comes between two frames (``fuse_fix``). While the filter is frozen, only
+        the turns of the wheels are summed.
+        """
         coasted = None
         is_right_sparse, is_left_sparse = self._right.is_sparse(right[0], dt_s), self._left.is_sparse(left[0], dt_s)
         if not (right[0] and left[0]) or self._coast.gap_s or is_right_sparse or is_left_sparse:
@@ -270,7 +292,8 @@ class FullStateLocalizer(LocalizerBase):
         hz, dx, dy, dz = fx * hx + fy * hy, x - ox, y - oy, self._estimate.terrain.height_m(x, y) - oz
         heading = atan2(bx * hx + by * hy + bz * hz, ax * hx + ay * hy + az * hz)
         self.pose = PanelPose(at.id, ax * dx + ay * dy + az * dz, bx * dx + by * dy + bz * dz, heading)
-        self.speed_m_s, self.rate_rad_s = now.v_m_s, now.omega_rad_s
+        self.speed_m_s = now.v_m_s
+        self.rate_rad_s = now.omega_rad_s
         if at is not self._creep_on:  # another panel, or the filter has made a step
             self._creep_on = at
             x, y = now.creep_x, now.creep_y
@@ -285,7 +308,8 @@ class FullStateLocalizer(LocalizerBase):
         return sqrt(max(0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b), 0.0))
 
     def _predict_pose(self, half_s: float) -> None:
-        self.position_sigma_m, self._creep_on = self._worst_sigma_m(), None
+        self.position_sigma_m = self._worst_sigma_m()
+        self._creep_on = None
         self._slope = self._estimate.slope()
         self._running.begin(self._filter.mean, self._slope, half_s, self._estimate.turn_creep_share)
         if self._rest.is_resting:
@@ -297,7 +321,8 @@ class FullStateLocalizer(LocalizerBase):
         self._running.trust(angle, self._gyro.variance, frame_s)
 
     def _use_rest(self, t_s: float) -> None:
-        reading, rested_s, self._rested_s = self._rest.take(), self._rested_s, 0.0
+        reading, rested_s = self._rest.take(), self._rested_s
+        self._rested_s = 0.0
         self._estimate.replay_buffer.begin(t_s, 0.0)
         if reading.samples:
             self._estimate.calibrate(reading, rested_s, (self._gyro.variance, self._accelerometer.variance))
@@ -338,7 +363,8 @@ class FullStateLocalizer(LocalizerBase):
             self._refuse(z, residual, variance)
             return
         self._refused.clear()
-        self._fixed_m, self._is_relocated = z, False
+        self._fixed_m = z
+        self._is_relocated = False
         self.counts["late_fixes"] += self._estimate.fix(t_s, z, variance) > 0
 
     def _relocate(self, z: FloatArray, residual: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:

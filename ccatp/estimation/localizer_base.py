@@ -42,7 +42,9 @@ class SampleSource:
     """The time stamps of one sensor. Each is used once, in increasing order."""
 
     def __init__(self, name: str) -> None:
-        self.name, self.newest_s, self.backward_run = name, -inf, 0
+        self.name = name
+        self.newest_s = -inf
+        self.backward_run = 0
         self.used: deque[Sequence[float]] = deque()
 
 
@@ -50,7 +52,8 @@ def use_samples(times_s: Sequence[float], oldest_s: float, *sources: SampleSourc
     """Record these time stamps, newer than all before and increasing, as used; drop those before ``oldest_s``."""
     newest_s = times_s[-1]
     for source in sources:
-        source.newest_s, source.backward_run = newest_s, 0
+        source.newest_s = newest_s
+        source.backward_run = 0
         used = source.used
         used.append(times_s)
         while used[0][-1] < oldest_s:
@@ -64,7 +67,8 @@ class SampleValidator:
     """
 
     def __init__(self, history_s: float, largest_rate_rad_s: float, counts: dict[str, int]) -> None:
-        self._history_s, self._largest_rad_s = history_s, largest_rate_rad_s
+        self._history_s = history_s
+        self._largest_rad_s = largest_rate_rad_s
         self._counts = counts
         self.backward_source = ""
         self.restart()
@@ -72,7 +76,8 @@ class SampleValidator:
     def restart(self) -> None:
         """Drop all time stamps, because the robot's clock has jumped."""
         self._imu = SampleSource("imu")
-        self._right, self._left = SampleSource("right encoder"), SampleSource("left encoder")
+        self._right = SampleSource("right encoder")
+        self._left = SampleSource("left encoder")
 
     def wheels(self, frame_s: float, encoders: Sequence[WheelSample]) -> tuple[WheelReadings, WheelReadings]:
         """The usable readings of the right and of the left wheel."""
@@ -188,7 +193,8 @@ class EdgeScanner:
                         found.append(SensorTransition(0.5 * (last + t), t - last, corner, bool(new)))
                 values = sample[1:]
             last = t
-        self._t_s, self._values = last, values
+        self._t_s = last
+        self._values = values
         return found
 
 
@@ -216,7 +222,9 @@ class LocalizerBase(ABC):
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, states: int, wrap: FilterWrap) -> None:
-        self.t_s, self.hold_cause, self.is_frozen = -inf, NO_CAUSE, False
+        self.t_s = -inf
+        self.hold_cause = NO_CAUSE
+        self.is_frozen = False
         self.gap_s = 0.0
         self.coasted: CoastedMotion | None = None
         self._coast = WheelCoast(cfg.robot.wheel_lag_s)
@@ -231,7 +239,8 @@ class LocalizerBase(ABC):
         self._stale_run = 0
         self._suspect_s: float | None = None
         self._intake = SampleValidator(cfg.localizer.history_s, largest_rate_rad_s(cfg.robot), self.counts)
-        self._imu_gate, self._wheel_means = ImuGate(cfg.health), WheelMeans(cfg.robot)
+        self._imu_gate = ImuGate(cfg.health)
+        self._wheel_means = WheelMeans(cfg.robot)
 
     @property
     def heading_sigma_rad(self) -> float:
@@ -262,7 +271,9 @@ class LocalizerBase(ABC):
         is_next = 0.0 < dt_s <= MAX_FRAME_STEP_S
         if not (is_next or self._is_new_time_base(t_s)):
             return
-        self.t_s, self._stale_run, self._suspect_s = t_s, 0, None
+        self.t_s = t_s
+        self._stale_run = 0
+        self._suspect_s = None
         intake, means = self._intake, self._wheel_means
         if not is_next:
             dt_s = 0.0

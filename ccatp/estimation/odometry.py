@@ -55,7 +55,8 @@ class Terrain:
 
     def _evaluate(self, x_m: float, y_m: float) -> Slope:
         self._f_m, fx, fy, fxx, fxy, fyy = self._surface.jet(x_m, y_m)
-        self._x_m, self._y_m = x_m, y_m
+        self._x_m = x_m
+        self._y_m = y_m
         gx, gy, gz = self._gravity
         norm = 1.0 + fx * fx + fy * fy
         # g minus its component along n = (-fx, -fy, 1)/W.
@@ -195,7 +196,8 @@ class Preintegrator:
     def stand(self, imu: Sequence[ImuSample]) -> None:
         """Take a frame at rest; its sample begins the trapezoid of the first moving frame."""
         self._last = (imu[-1][1], imu[-1][2]) if imu else None
-        self._before, self._missed = None, 0
+        self._before = None
+        self._missed = 0
 
     def add(self, dt_s: float, imu: Sequence[ImuSample], *, is_turning: bool) -> None:
         """Take a frame of length ``dt_s`` with the last of its inertial samples."""
@@ -208,7 +210,8 @@ class Preintegrator:
                 self._last = None
             return
         _, ax, wz = imu[-1]
-        last, frames, self._missed = self._last, self._missed + 1, 0
+        last, frames = self._last, self._missed + 1
+        self._missed = 0
         if last is not None:
             self._accelerations += frames * (last[0] + ax)
             self._rates += frames * (last[1] + wz)
@@ -288,7 +291,8 @@ class WheelAngle:
         if not times_s:
             return self._bridge(dt_s)
         if self._t_s == -inf:
-            self._t_s, self._rate = times_s[0], rates_rad_s[0]
+            self._t_s = times_s[0]
+            self._rate = rates_rad_s[0]
         is_counter = self.is_counter
         if not is_counter:
             if 0.0 in rates_rad_s:
@@ -307,7 +311,8 @@ class WheelAngle:
             turned = self._counted(times_s, rates_rad_s) if is_counter else self._integrated(times_s, rates_rad_s)
         if elapsed_s > 0.0:
             self._mean_rate += (turned - self._mean_rate * elapsed_s) / (elapsed_s + _LATELY_S)
-        self._t_s, self._rate = times_s[-1], rates_rad_s[-1]
+        self._t_s = times_s[-1]
+        self._rate = rates_rad_s[-1]
         if self._bridged_s:
             turned -= self._bridged_rad
             self._bridged_s = self._bridged_rad = 0.0
@@ -325,7 +330,8 @@ class WheelAngle:
 
     def coast(self, turned_rad: float) -> None:
         """Take a predicted turn in place of the samples of a frame."""
-        self.is_fresh, self.is_coasting = False, True
+        self.is_fresh = False
+        self.is_coasting = True
         self._coasted_rad += turned_rad
         self.angle_rad += turned_rad
 
@@ -342,10 +348,13 @@ class WheelAngle:
         period_s = self._period_s if self._period_s < inf else _GAP_S
         self.has_lost = times_s[0] - self._t_s > _LOST * period_s
         if not self.has_lost:
-            self._bridged_s, self._bridged_rad = self._bridged_s + period_s, self._bridged_rad + coasted_rad
+            self._bridged_s = self._bridged_s + period_s
+            self._bridged_rad = self._bridged_rad + coasted_rad
             return times_s, rates_rad_s
         self._bridged_s = self._bridged_rad = 0.0
-        self._t_s, self._rate, self._mean_rate = since_s, rate_rad_s, rate_rad_s
+        self._t_s = since_s
+        self._rate = rate_rad_s
+        self._mean_rate = rate_rad_s
         first = next((k for k, t_s in enumerate(times_s) if t_s > since_s), len(times_s))
         return times_s[first:], rates_rad_s[first:]
 
@@ -391,14 +400,16 @@ class WheelAngle:
                 if -least < step < least and step:
                     least = abs(step)
             t0 = t
-        self.quantum_rad, self._period_s = least, period
+        self.quantum_rad = least
+        self._period_s = period
         return turned
 
     def _is_counting(self, rates_rad_s: Sequence[float]) -> bool:
         for rate in rates_rad_s:
             self._zeros = self._zeros + 1 if rate == 0.0 else 0
         if self._zeros >= _ZEROS_OF_A_COUNTER:
-            self.is_counter, self.noise_rad2_s2 = True, 0.0
+            self.is_counter = True
+            self.noise_rad2_s2 = 0.0
             self._seen = 0
         return self.is_counter
 

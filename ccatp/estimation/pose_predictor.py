@@ -15,7 +15,8 @@ class PosePredictor:
     """
 
     def __init__(self, wheel_radius_m: float, wheel_base_m: float, jerk_density_m2_s5: float) -> None:
-        self._radius_m, self._base_m = wheel_radius_m, wheel_base_m
+        self._radius_m = wheel_radius_m
+        self._base_m = wheel_base_m
         self._jerk_density_m2_s5 = jerk_density_m2_s5
         self._noise = (0.0, 0.0, 0.0)
         self._speed_gain = self._gyro_share = 0.0
@@ -25,21 +26,31 @@ class PosePredictor:
     def begin(self, mean: FloatArray, slope: Slope, half_s: float, turn_creep_share: float = 1.0) -> None:
         """Begin after a step of the filter of length 2 ``half_s``, whose mean speed belongs to the middle."""
         q: list[float] = mean.tolist()
-        self.x_m, self.y_m, self.heading_rad = q[X], q[Y], q[PSI]
-        self._a, self._bias = q[A], q[BG]
-        self.v_m_s, self.omega_rad_s = q[V] + q[A] * half_s, q[W]
+        self.x_m = q[X]
+        self.y_m = q[Y]
+        self.heading_rad = q[PSI]
+        self._a = q[A]
+        self._bias = q[BG]
+        self.v_m_s = q[V] + q[A] * half_s
+        self.omega_rad_s = q[W]
         self._per_scale = 1.0 / (1.0 + q[KG])
-        self._right_m, self._left_m = self._radius_m * (1.0 - q[SR]), self._radius_m * (1.0 - q[SL])
+        self._right_m = self._radius_m * (1.0 - q[SR])
+        self._left_m = self._radius_m * (1.0 - q[SL])
         self._per_base = 1.0 / (self._base_m * (1.0 + q[KL]))
         fx, fy, fxx, fxy, _, gx, gy = slope
         s2 = 1.0 + fx * fx
         s = sqrt(s2)
         norm = sqrt(s2 + fy * fy)
-        self._along, self._ex, self._ey = 1.0 / s, -fx * fy / (norm * s), s / norm
-        self._k1, self._k2 = fy * fxx / (s2 * norm), fy * fxy / (s2 * norm)
-        self.creep_x, self.creep_y = q[C] * gx, q[C] * gy
+        self._along = 1.0 / s
+        self._ex = -fx * fy / (norm * s)
+        self._ey = s / norm
+        self._k1 = fy * fxx / (s2 * norm)
+        self._k2 = fy * fxy / (s2 * norm)
+        self.creep_x = q[C] * gx
+        self.creep_y = q[C] * gy
         turn_creep = q[CT] * turn_creep_share
-        self._turn_creep_x, self._turn_creep_y = turn_creep * gx, turn_creep * gy
+        self._turn_creep_x = turn_creep * gx
+        self._turn_creep_y = turn_creep * gy
 
     def trust(self, angle_variance_rad2: float, rate_variance_rad2_s2: float, dt_s: float) -> None:
         """Set the noise of one wheel's travel in a frame of ``dt_s``, and of a gyroscope sample."""

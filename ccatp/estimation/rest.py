@@ -26,7 +26,8 @@ class NoiseFloor:
 
     def restart(self) -> None:
         """Begin another rest with a new block. The last mean is kept, because the bias hardly changes between rests."""
-        self._sum, self._count = 0.0, 0
+        self._sum = 0.0
+        self._count = 0
 
     def add(self, value: float) -> None:
         """Take one sample at rest."""
@@ -39,7 +40,9 @@ class NoiseFloor:
             # The variance of a difference is twice that of a mean.
             found = 0.5 * _BLOCK * (mean - self._before) ** 2
             self.variance += _MEMORY * (found - self.variance)
-        self._sum, self._count, self._before = 0.0, 0, mean
+        self._sum = 0.0
+        self._count = 0
+        self._before = mean
 
 
 class ZeroVelocityReading(NamedTuple):
@@ -62,7 +65,8 @@ class ZeroVelocityDetector:
 
     def __init__(self, rest_after_s: float, gyro: NoiseFloor, accelerometer: NoiseFloor) -> None:
         self._rest_after_s = rest_after_s
-        self._gyro, self._accelerometer = gyro, accelerometer
+        self._gyro = gyro
+        self._accelerometer = accelerometer
         self.still_s = 0.0
         self.is_resting = False
         self._clear()
@@ -73,7 +77,8 @@ class ZeroVelocityDetector:
 
     def moved(self) -> None:
         """Take a frame in which the wheels turned."""
-        self.still_s, self.is_resting = 0.0, False
+        self.still_s = 0.0
+        self.is_resting = False
         self._clear()
 
     def stood(self, dt_s: float) -> bool:

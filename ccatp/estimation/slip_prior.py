@@ -118,7 +118,8 @@ class SlipPrior:
         return slip, _DIFFERENCE * slip, creep, turn_creep
 
     def _open(self) -> None:
-        self._is_open, self._wandered = True, 0.0
+        self._is_open = True
+        self._wandered = 0.0
         self._prior = self._means, self._variances + self._scatters
 
     @property
@@ -143,7 +144,8 @@ class SlipPrior:
         before, self._scatters = self._scatters, self._learned()
         beta = self._variances / (self._variances + before)
         own = self._variances * (1.0 - beta)
-        self._means, self._variances = self._means + beta * (found - self._means), own + beta * beta * known
+        self._means = self._means + beta * (found - self._means)
+        self._variances = own + beta * beta * known
         self._open()
         F, Q = (_STATES * beta).dot(_PARAMETERS), (_STATES * (own + self._scatters)).dot(_STATES.T)
         return F, _STATES.dot(self._means) - F.dot(mean[SLIPS]), Q

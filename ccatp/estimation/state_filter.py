@@ -40,11 +40,15 @@ class SurveyFilter:
     def __init__(self, filter_: Filter, mirror: Mirror, cfg: Config, counts: dict[str, int], start: DeckPose) -> None:
         robot = cfg.robot
         self.innovation: Innovation | None = None
-        self._turn_creep, self.turn_creep_share = TurnCreep(robot), 1.0  # in the last step
-        self._cfg, self._full = cfg.localizer, cfg.localizer.full_state
+        self._turn_creep = TurnCreep(robot)
+        self.turn_creep_share = 1.0  # in the last step
+        self._cfg = cfg.localizer
+        self._full = cfg.localizer.full_state
         self.replay_buffer = ReplayBuffer(filter_, self._full.rewind_s)
-        self._filter, self._counts = filter_, counts
-        self._mirror, self.terrain = mirror, Terrain(mirror)
+        self._filter = filter_
+        self._counts = counts
+        self._mirror = mirror
+        self.terrain = Terrain(mirror)
         self._motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
         self._base_per_radius = 0.5 * robot.wheel_base_m / robot.wheel_radius_m
         self._drift = np.zeros(sm.STATES)
@@ -359,7 +363,8 @@ class ReplayBuffer:
     """
 
     def __init__(self, filter_: Filter, reach_s: float) -> None:
-        self._filter, self._reach_s = filter_, reach_s
+        self._filter = filter_
+        self._reach_s = reach_s
         self._entries: list[_Entry] = []
         self.is_replaying = False
 
@@ -382,7 +387,9 @@ class ReplayBuffer:
                 # before them.
                 del entries[:-2]
                 for entry in entries:
-                    entry.kept_s, entry.mean, entry.covariance = t_s, filter_.mean, filter_.covariance
+                    entry.kept_s = t_s
+                    entry.mean = filter_.mean
+                    entry.covariance = filter_.covariance
                     entry.steps.clear()
             return
         entries.append(_Entry(t_s, dt_s, filter_.mean, filter_.covariance, t_s))
@@ -424,7 +431,8 @@ class ReplayBuffer:
         self.is_replaying = True
         try:
             for entry in later:
-                entry.mean, entry.covariance = filter_.mean, filter_.covariance
+                entry.mean = filter_.mean
+                entry.covariance = filter_.covariance
                 for again in entry.steps:
                     again()
         finally:

@@ -18,7 +18,8 @@ class Affine:
     """x <- F x + b, F (n, n), b (n,), as a model for the nonlinear filters."""
 
     def __init__(self, F: FloatArray, b: FloatArray) -> None:
-        self._F, self._b = F, b
+        self._F = F
+        self._b = b
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Image of x (n,) and the Jacobian (n, n)."""
@@ -64,12 +65,16 @@ class SurveyMotion:
     """
 
     def __init__(self, wheel_radius_m: float, wheel_base_m: float) -> None:
-        self._radius_m, self._half_base_m = wheel_radius_m, 0.5 * wheel_base_m
-        self._x, self._F = np.zeros(STATES), np.eye(STATES)
+        self._radius_m = wheel_radius_m
+        self._half_base_m = 0.5 * wheel_base_m
+        self._x = np.zeros(STATES)
+        self._F = np.eye(STATES)
 
     def over(self, dt_s: float, slope: Slope, creep_share: float = 1.0) -> "SurveyMotion":
         """Set the duration of the step, the slope of the ground, and ``share``."""
-        self._dt_s, self._slope, self._share = dt_s, slope, creep_share
+        self._dt_s = dt_s
+        self._slope = slope
+        self._share = creep_share
         self._of: FloatArray | None = None
         return self
 
@@ -174,7 +179,9 @@ class SensorRows:
 
     def __init__(self, readings: Sequence[tuple[int, float, float]]) -> None:
         states, z, R = zip(*readings, strict=True)
-        self._rows, self.z, self.R = states, np.array(z), np.array(R)
+        self._rows = states
+        self.z = np.array(z)
+        self.R = np.array(R)
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Expected measurements (m,) and the Jacobian (m, n)."""

@@ -102,8 +102,10 @@ class ConstantAcceleration:
 
     def __init__(self, cfg: LocalizerConfig) -> None:
         four = cfg.four_state
-        self._jerk, self._alpha = four.jerk_density_m2_s5, four.angular_acceleration_density_rad2_s3
-        self._F, self._Q = np.eye(STATES), np.zeros((STATES, STATES))
+        self._jerk = four.jerk_density_m2_s5
+        self._alpha = four.angular_acceleration_density_rad2_s3
+        self._F = np.eye(STATES)
+        self._Q = np.zeros((STATES, STATES))
 
     def over(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
         """F and Q (4, 4) over dt_s; work space, valid until the next call."""
@@ -182,9 +184,12 @@ class FourStateLocalizer(LocalizerBase):
         self._gate = HeadingGate(cfg.four_state.crossing_gate_sigma)
         self._sigma = PositionSigma(cfg.start_position_sigma_m, cfg.four_state.slip_fraction)
         self._deck: DeckPose | None = None
-        self._radius_m, self._base_m = config.robot.wheel_radius_m, config.robot.wheel_base_m
-        self._wheels_s, self._pause_s = -inf, inf  # last frame with samples of both wheels, shortest time between two
-        self._x_m, self._y_m = start.x_m, start.y_m
+        self._radius_m = config.robot.wheel_radius_m
+        self._base_m = config.robot.wheel_base_m
+        self._wheels_s = -inf  # last frame with samples of both wheels
+        self._pause_s = inf  # shortest time between two such frames
+        self._x_m = start.x_m
+        self._y_m = start.y_m
         self._enter(start.panel)
         self._reset_at_rest(start.heading_rad, cfg.start_heading_sigma_rad**2)
 
@@ -325,7 +330,8 @@ class FourStateLocalizer(LocalizerBase):
             self._reset_at_rest(float(self._filter.mean[THETA]), prior)
             self._sigma.widen(self._cfg.start_position_sigma_m)
         gain = self._sigma.fuse(variance)
-        self._x_m, self._y_m = self._x_m + gain * ex, self._y_m + gain * ey
+        self._x_m = self._x_m + gain * ex
+        self._y_m = self._y_m + gain * ey
         self._deck = None
         self.counts["fixes"] += 1
         self.gap_s = self._coast.gap_s
@@ -347,7 +353,8 @@ class FourStateLocalizer(LocalizerBase):
             raise
         v, turn = 0.5 * (v0 + v1), theta1 - theta0
         dx, dy = arc_step(v, theta0, turn, dt_s)
-        self._x_m, self._y_m = self._x_m + dx, self._y_m + dy
+        self._x_m = self._x_m + dx
+        self._y_m = self._y_m + dy
         self._deck = None
         self._odometer.advance(self.t_s, v, turn, dt_s)
         self._sigma.travel(abs(v) * dt_s, self.heading_sigma_rad)
@@ -361,7 +368,8 @@ class FourStateLocalizer(LocalizerBase):
         if panel is None or panel == self._panel:
             return
         new = self._mirror.panel_pose(panel, deck)
-        self._x_m, self._y_m = new.x_m, new.y_m
+        self._x_m = new.x_m
+        self._y_m = new.y_m
         mean = self._filter.mean.copy()
         mean[THETA] += difference(new.heading_rad, float(mean[THETA]))
         self._filter.reset(mean, self._filter.covariance)
@@ -370,7 +378,8 @@ class FourStateLocalizer(LocalizerBase):
     def _enter(self, panel: PanelId) -> None:
         self._panel = panel
         found = self._mirror.panel(panel)
-        self._near_x_m, self._near_y_m = _NEAR_BORDER * found.half_x_m, _NEAR_BORDER * found.half_y_m
+        self._near_x_m = _NEAR_BORDER * found.half_x_m
+        self._near_y_m = _NEAR_BORDER * found.half_y_m
 
     def _use_crossings(self, transitions: Sequence[SensorTransition]) -> None:
         filter_ = self._filter

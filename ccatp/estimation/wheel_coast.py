@@ -108,7 +108,8 @@ class WheelCoast:
 
     def stand(self) -> None:
         """The wheels stand, and their set points are zero."""
-        self._follows, self._travels = [0.0, 0.0], [0.0, 0.0]
+        self._follows = [0.0, 0.0]
+        self._travels = [0.0, 0.0]
         self._is_known = True
 
     def follow(self, dt_s: float, set_points: WheelInput, right_rad: float, left_rad: float) -> None:
@@ -150,13 +151,17 @@ class WheelCoast:
 
     def begin(self, right_rad_s: float, left_rad_s: float, reading_rad2: float, *, is_resting: bool) -> None:
         """Begin a gap at these rates of the wheels; ``reading_rad2``: variance of an angle's reading."""
-        self._first2, self._shown2 = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]  # right, left, both
+        # right, left, both
+        self._first2 = [0.0, 0.0, 0.0]
+        self._shown2 = [0.0, 0.0, 0.0]
         self._first_set: tuple[float, float] | None = None
-        self._by_lag, self._largest = (0.0, 0.0), 0.0
+        self._by_lag = (0.0, 0.0)
+        self._largest = 0.0
         self._largest_step = 0.0  # square of the largest change of the set points in the gap
         self._coasted = [0.0, 0.0]
         self._is_turn = right_rad_s * left_rad_s < 0.0
-        self._kept, self._free = 1.0, (right_rad_s, left_rad_s)
+        self._kept = 1.0
+        self._free = (right_rad_s, left_rad_s)
         self.rates = right_rad_s, left_rad_s
         self.has_moved = False
         if is_resting:

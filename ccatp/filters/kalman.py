@@ -84,7 +84,9 @@ class KalmanFilter:
         """Re-initialise with copies of ``mean`` (n,) and ``covariance`` (n, n); see ``Filter.reset``."""
         x, P = checked_gaussian(mean, covariance, (self._states, self._states))
         self._L = square_root(P)
-        self._x, self._F, self._P = x, np.eye(self._states), P
+        self._x = x
+        self._F = np.eye(self._states)
+        self._P = P
 
     def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """Advance by F (n, n) and Q (n, n), thesis eqs 2.5 and 2.6; see ``Filter.predict``."""
@@ -107,7 +109,9 @@ class KalmanFilter:
         if not (ddot(x, x) < HUGE and is_finite(P)):
             raise FilterDiverged(f"prediction is not finite: mean {x.tolist()}")
         self._L = square_root(P)
-        self._x, self._F, self._P = x, F, None
+        self._x = x
+        self._F = F
+        self._P = None
 
     def _condition(self, nu: FloatArray, HL: FloatArray, L: FloatArray, R: FloatArray) -> Innovation:
         """Eqs 2.8 to 2.10 with P = L L^T, L (n, k), and H L (m, k)."""
@@ -123,5 +127,7 @@ class KalmanFilter:
         nis = ddot(y, y)
         if not ddot(x, x) + nis < HUGE:
             raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {nu.tolist()}")
-        self._x, self._L, self._P = x, L, None
+        self._x = x
+        self._L = L
+        self._P = None
         return Innovation(nu, nis)

@@ -49,14 +49,18 @@ class EdgeRule:
     """
 
     def __init__(self, edge_map: EdgeMap, robot: RobotConfig, cfg: DangerConfig) -> None:
-        self._map, self._robot, self._stale_after_s = edge_map, robot, cfg.stale_after_s
+        self._map = edge_map
+        self._robot = robot
+        self._stale_after_s = cfg.stale_after_s
         self._reach_s = 2.0 * max(cfg.stale_after_s, cfg.estimate_stale_after_s)
         self._offsets = robot.edge_sensors_m
         self._limits = EdgeLimits(edge_map.gap_m, cfg)
         self._half_base_m = 0.5 * robot.wheel_base_m
-        self._clear_samples, self._lifted_samples = cfg.clear_samples, cfg.lifted_samples
+        self._clear_samples = cfg.clear_samples
+        self._lifted_samples = cfg.lifted_samples
         self._worst_m_s = tuple(_fastest(robot, offset) for offset in robot.edge_sensors_m)
-        self.opened, self.declared = [0, 0, 0, 0], [0, 0, 0, 0]
+        self.opened = [0, 0, 0, 0]
+        self.declared = [0, 0, 0, 0]
         self.reset()
 
     def reset(self) -> None:
@@ -215,10 +219,12 @@ class CentreClearanceCheck:
     def __init__(self, rim: Rim, robot: RobotConfig, cfg: DangerConfig) -> None:
         self._rim = rim
         self._lead_m = min(min(abs(x), abs(y)) for x, y in robot.edge_sensors_m)
-        self._sigmas, self._margin_m = cfg.map_sigmas, cfg.map_margin_m
+        self._sigmas = cfg.map_sigmas
+        self._margin_m = cfg.map_margin_m
         self._fastest_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
         self.direction = 0
-        self.clearance_m, self.limit_m = inf, 0.0
+        self.clearance_m = inf
+        self.limit_m = 0.0
         self._look_at_s = -inf
 
     def step(self, t_s: float, estimate: EstimateMessage, wheels: Sequence[WheelSample]) -> None:

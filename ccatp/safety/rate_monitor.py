@@ -49,7 +49,8 @@ class RateMonitor(Monitor):
         span_s = t_s - self._begin_s
         if span_s >= self._cfg.rate_time_s - 1e-6:
             self._judge(span_s)
-            self._begin_s, self._counts = t_s, [0, 0, 0]
+            self._begin_s = t_s
+            self._counts = [0, 0, 0]
 
     def _judge(self, span_s: float) -> None:
         rates = [count / span_s for count in self._counts]

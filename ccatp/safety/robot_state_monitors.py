@@ -45,7 +45,8 @@ class FanMonitor(Monitor):
     def reset(self) -> None:
         """See ``Monitor``."""
         super().reset()
-        self._low, self._weak = Since(), Since()
+        self._low = Since()
+        self._weak = Since()
         self._first_s: float | None = None
         self._was_right = False
         self._sound: tuple[float, float] | None = None  # the newest duties, if they are high enough
@@ -90,7 +91,8 @@ class BatteryMonitor(Monitor):
     def reset(self) -> None:
         """Begin the durations again; the finding stays."""
         super().reset()
-        self._low, self._reported = Since(), Since()
+        self._low = Since()
+        self._reported = Since()
 
     def findings(self, t_s: float) -> list[MonitorFinding]:
         """See ``Monitor``."""

@@ -37,7 +37,8 @@ class SafetyRules(EmergencyRules):
             return self.stale(seq, t_s)
         self._frame_seq = seq
         if estimate is not None:
-            self._state, self._state_seq = estimate.state, estimate.seq
+            self._state = estimate.state
+            self._state_seq = estimate.seq
         free = Verdict(seq, t_s, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
         return self.latch.with_emergencies(self.latch.verdict(seq, t_s) or free)
 

@@ -92,7 +92,8 @@ class SpeedRatioMonitor(Monitor):
         share = self._lag_s * (1.0 - keep) / length_s
         ends = [(u + (v - u) * share, u + (v - u) * keep) for u, v in zip(set_points, speeds, strict=True)]
         mean, before = (ends[0][0], ends[1][0]), self._mean
-        self._speeds, self._mean = (ends[0][1], ends[1][1]), mean
+        self._speeds = (ends[0][1], ends[1][1])
+        self._mean = mean
         measured = travelled[0] / covered_s, travelled[1] / covered_s
         growth = mean[0] - before[0], mean[1] - before[1]
         window, since_s = self._window, t_s - self._cfg.ratio_time_s

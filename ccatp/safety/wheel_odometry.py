@@ -35,7 +35,8 @@ class WheelTrack:
         self._limit_rad_s = limit_rad_s
         self._half_radius_m = 0.5 * wheel_radius_m
         self._radius_per_base = wheel_radius_m / wheel_base_m
-        self._hold_s, self._reach_s = hold_s, reach_s
+        self._hold_s = hold_s
+        self._reach_s = reach_s
         self._frames: deque[Sequence[WheelSample]] = deque(maxlen=HISTORY_FRAMES)
         self._right = self._left = 0.0
         self._right_t_s = self._left_t_s = self._usable_t_s = -inf
@@ -75,9 +76,11 @@ class WheelTrack:
             if t_s <= self._right_t_s or t_s <= self._left_t_s:
                 continue
             if right is not None and -limit <= right <= limit:
-                self._right, self._right_t_s = right, t_s
+                self._right = right
+                self._right_t_s = t_s
             if left is not None and -limit <= left <= limit:
-                self._left, self._left_t_s = left, t_s
+                self._left = left
+                self._left_t_s = t_s
             if t_s - self._right_t_s <= hold_s and t_s - self._left_t_s <= hold_s:
                 both, turning = self._right + self._left, self._right - self._left
                 self.knots.append(Knot(t_s, half_radius_m * both, radius_per_base * turning))
@@ -145,7 +148,8 @@ class Odometry:
             self.y_m += step * sin(middle)
             self.heading_rad += turn
             self.t_s = t_s
-        self.v_m_s, self.omega_rad_s = v_m_s, omega_rad_s
+        self.v_m_s = v_m_s
+        self.omega_rad_s = omega_rad_s
 
 
 def pose_at(

@@ -17,9 +17,12 @@ class ImuGate:
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
-        self._rate, self._share = cfg.imu_rate_rad_s, cfg.imu_rate_share
-        self._largest, self._jump = cfg.imu_largest_rad_s, cfg.imu_jump_rad_s
-        self._acceleration, self._identical = cfg.imu_acceleration_m_s2, cfg.identical_samples
+        self._rate = cfg.imu_rate_rad_s
+        self._share = cfg.imu_rate_share
+        self._largest = cfg.imu_largest_rad_s
+        self._jump = cfg.imu_jump_rad_s
+        self._acceleration = cfg.imu_acceleration_m_s2
+        self._identical = cfg.identical_samples
         self._quarantine_s = cfg.imu_quarantine_s
         self.reset()
 
@@ -29,7 +32,9 @@ class ImuGate:
         self._same_ax = self._same_wz = self._different = 0
         self._is_noisy = False
         self._bad_s = -inf
-        self.cause, self.value, self.limit = "", 0.0, 0.0
+        self.cause = ""
+        self.value = 0.0
+        self.limit = 0.0
         self.out_since_s = inf
 
     def admit(self, samples: Sequence[ImuSample], yaw_rad_s: float) -> Sequence[ImuSample]:
@@ -43,7 +48,8 @@ class ImuGate:
             # The first reading is not a repetition.
             self._same_ax = self._same_ax + 1 if ax == self._ax else 0
             self._same_wz = self._same_wz + 1 if wz == self._wz else 0
-            self._ax, self._wz = ax, wz
+            self._ax = ax
+            self._wz = wz
             if not -largest <= wz <= largest or (not -limit <= off <= limit and not -self._jump <= jump <= self._jump):
                 self._blame(t_s, "the gyroscope's rate is impossible", off, limit)
             elif not -self._acceleration <= ax <= self._acceleration:
@@ -54,7 +60,8 @@ class ImuGate:
             if -self._quarantine_s < t_s - self._bad_s < self._quarantine_s:
                 is_good = False
             elif self.cause:
-                self.cause, self.out_since_s = "", inf
+                self.cause = ""
+                self.out_since_s = inf
         return samples if is_good else ()
 
     def _compare(self, ax: float, wz: float, yaw_rad_s: float) -> None:
@@ -67,4 +74,7 @@ class ImuGate:
     def _blame(self, t_s: float, cause: str, value: float, limit: float) -> None:
         self._bad_s = t_s
         if not self.cause:
-            self.cause, self.value, self.limit, self.out_since_s = cause, float(value), float(limit), t_s
+            self.cause = cause
+            self.value = float(value)
+            self.limit = float(limit)
+            self.out_since_s = t_s

@@ -36,12 +36,14 @@ class WheelMeans:
         if not (-limit <= right_rad_s <= limit and -limit <= left_rad_s <= limit):
             self._take_some(right, left)
             return
-        self.right_rad_s, self.left_rad_s = right_rad_s, left_rad_s
+        self.right_rad_s = right_rad_s
+        self.left_rad_s = left_rad_s
         share = dt_s / (self._SMOOTH_S + dt_s)
         self.yaw_rad_s += share * (self._per_base * (right_rad_s - left_rad_s) - self.yaw_rad_s)
 
     def _take_some(self, right: Sequence[float | None], left: Sequence[float | None]) -> None:
-        self.right_rad_s, self.left_rad_s = self._mean(right), self._mean(left)
+        self.right_rad_s = self._mean(right)
+        self.left_rad_s = self._mean(left)
 
     def _mean(self, rates: Sequence[float | None]) -> float | None:
         limit = self._limit_rad_s
