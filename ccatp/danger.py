@@ -25,7 +25,7 @@ from ccatp import conditions
 from ccatp.clocks import SteadyTime
 from ccatp.conditions import MonitorFinding
 from ccatp.config.models import Config, DangerConfig, HealthConfig, RobotConfig
-from ccatp.core import NO_MOTION, Corner, EdgeSample, EventCode, Permits, Verdict, WheelSample
+from ccatp.core import NO_MOTION, Corner, DeckPose, EdgeSample, EventCode, Permits, Verdict, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
@@ -177,7 +177,7 @@ class DangerMonitor(SafetyRules):
         return health.findings
 
     def _place(self, known: EstimateMessage, sensor: int) -> tuple[float, float]:
-        pose = known.x_m, known.y_m, known.heading_rad
+        pose = DeckPose(known.x_m, known.y_m, known.heading_rad)
         return self._map.place(pose, self._robot.edge_sensors_m[sensor])
 
     def _is_explained(self, sensor: int) -> bool:

@@ -30,6 +30,15 @@ class SetPoints(NamedTuple):
     left_doubt_rad: float = 0.0
 
 
+class SentSpan(NamedTuple):
+    """Lowest and highest set points of the right and the left wheel, rad/s."""
+
+    right_low: float
+    right_high: float
+    left_low: float
+    left_high: float
+
+
 class SentDrives:
     """Predicts the state of a frame over the drives that were sent but have not acted yet; tells which ones acted.
 
@@ -89,12 +98,9 @@ class SentDrives:
         elif left_rad_s > self._left_high:
             self._left_high = left_rad_s
 
-    def take_span(self) -> tuple[float, float, float, float]:
-        """Lowest and highest set points of the right, then the left wheel since the last call, rad/s.
-
-        The drive in force at the last call is included.
-        """
-        span = self._right_low, self._right_high, self._left_low, self._left_high
+    def take_span(self) -> SentSpan:
+        """The set points since the last call; the drive in force then is included."""
+        span = SentSpan(self._right_low, self._right_high, self._left_low, self._left_high)
         self._right_low = self._right_high = self.rates[0]
         self._left_low = self._left_high = self.rates[1]
         return span

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from math import atan2, cos, hypot, inf, sin, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,6 +41,14 @@ _SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # for the error of the heading,
 _TRUSTED_GAP_S = 0.03  # after a longer gap the odometry of the leg teaches nothing about slip and sensors
 _NOTHING: WheelReadings = (), ()
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
+
+
+class GapFrame(NamedTuple):
+    """The samples of the wheels to use; ``coasted``: in a gap the motion that the set points predict."""
+
+    right: WheelReadings
+    left: WheelReadings
+    coasted: CoastedMotion | None
 
 
 class FullStateLocalizer(LocalizerBase):
@@ -218,10 +227,8 @@ class FullStateLocalizer(LocalizerBase):
 
     # -- frames without encoder samples -------------------------------------------------------------------------------
 
-    def _coasted(
-        self, dt_s: float, right: WheelReadings, left: WheelReadings, set_points: WheelInput
-    ) -> tuple[WheelReadings, WheelReadings, CoastedMotion | None]:
-        """The samples to use of a frame in a gap, at its end, or of slow encoders; the predicted motion in a gap."""
+    def _coasted(self, dt_s: float, right: WheelReadings, left: WheelReadings, set_points: WheelInput) -> GapFrame:
+        """A frame in a gap, at its end, or of slow encoders."""
         coast, since_s, is_resting = self._coast, self.t_s - dt_s, self._rest.is_resting
         wheels = self._right, self._left
         is_right, is_left = (
@@ -250,7 +257,7 @@ class FullStateLocalizer(LocalizerBase):
             self._rebase()
             if not is_resting:
                 self._estimate.resume(sqrt(max(wheel.variance_rad2() for wheel in wheels)))
-        return right, left, coasted
+        return GapFrame(right, left, coasted)
 
     @staticmethod
     def _turn(wheel: WheelAngle, readings: WheelReadings, dt_s: float, coasted_rad: float) -> float:

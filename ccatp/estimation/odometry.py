@@ -68,14 +68,23 @@ class Terrain:
         return self._slope
 
 
-def axes_on(slope: Slope, psi: float) -> tuple[float, float, float, float]:
-    """Deck components (hx, hy, lx, ly) of the robot's x and y axes, as ``Mirror.body_axes``."""
+class BodyAxes(NamedTuple):
+    """Deck components of the robot's x axis (h, to the front) and y axis (l, to the left)."""
+
+    hx: float
+    hy: float
+    lx: float
+    ly: float
+
+
+def axes_on(slope: Slope, psi: float) -> BodyAxes:
+    """The axes of a robot with heading ``psi``, as ``Mirror.body_axes``."""
     fx, fy = slope[0], slope[1]
     s2 = 1.0 + fx * fx
     s, norm = sqrt(s2), sqrt(s2 + fy * fy)
     ex, ey = -fx * fy / (norm * s), s / norm
     c, d = cos(psi), sin(psi)
-    return c / s + d * ex, d * ey, c * ex - d / s, c * ey
+    return BodyAxes(c / s + d * ex, d * ey, c * ex - d / s, c * ey)
 
 
 def gravity_on(slope: Slope, psi: float, gravity: Vector3) -> Vector3:

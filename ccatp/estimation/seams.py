@@ -22,13 +22,24 @@ _REACH = 0.05
 _UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
 
 
+class PairHeading(NamedTuple):
+    """Heading by two sensors of a pair at the right sensor's crossing, rad, modulo pi.
+
+    ``length_m``: of the vector u between their crossings; ``across_m``: its component across the robot.
+    """
+
+    heading_rad: float
+    length_m: float
+    across_m: float
+
+
 def heading_from_pair(
     left: OdometryPose,
     right: OdometryPose,
     left_xy: tuple[float, float],
     right_xy: tuple[float, float],
     normal_rad: float,
-) -> tuple[float, float, float]:
+) -> PairHeading:
     """Heading of the robot from two of its sensors (robot frame, m) that have crossed the same straight line.
 
     Both sensors were on the line, so the vector between the two crossings, with the sensors' own offset, lies along it.
@@ -39,16 +50,14 @@ def heading_from_pair(
 
     In pure translation u = (s_left - s_right, w) and this is ``theta = phi + atan((s_left - s_right)/w)``, thesis eq.
     2.15 and 2.16 with a sign: positive travel is forward, so one formula holds for every edge, driven forward or in
-    reverse, with either sensor first. A turn between the two crossings is taken from the odometer.
-
-    Returns the heading at the right sensor's crossing, rad, in the frame of ``normal_rad``, modulo pi; |u|, m; and the
-    component of u across the robot, m.
+    reverse, with either sensor first. A turn between the two crossings is taken from the odometer. The heading is in
+    the frame of ``normal_rad``.
     """
     turn = left.heading_rad - right.heading_rad
     dx, dy = rotate(left.x_m - right.x_m, left.y_m - right.y_m, -right.heading_rad)
     lx, ly = rotate(*left_xy, turn)
     ux, uy = lx + dx - right_xy[0], ly + dy - right_xy[1]
-    return normal_rad + 0.5 * pi - atan2(uy, ux), hypot(ux, uy), abs(uy)
+    return PairHeading(normal_rad + 0.5 * pi - atan2(uy, ux), hypot(ux, uy), abs(uy))
 
 
 class _Mark(NamedTuple):
@@ -125,13 +134,14 @@ class CrossingDetector:
         x, y = 0.5 * (left.x_m + right.x_m), 0.5 * (left.y_m + right.y_m)
         normal = self._mirror.seam_normal_angle(pose.panel, left.seam.axis, x, y)
         left_xy, right_xy = self._sensors[pair[0]], self._sensors[pair[1]]
-        heading, length, across = heading_from_pair(left.place, right.place, left_xy, right_xy, normal)
+        by_pair = heading_from_pair(left.place, right.place, left_xy, right_xy, normal)
         estimate = pose.heading_rad + right.place.heading_rad - now.heading_rad
-        innovation = (heading - estimate + 0.5 * pi) % pi - 0.5 * pi
+        innovation = (by_pair.heading_rad - estimate + 0.5 * pi) % pi - 0.5 * pi
         travel = hypot(left.place.x_m - right.place.x_m, left.place.y_m - right.place.y_m)
         timing = self._timing_variance(left) + self._timing_variance(right)
         # An error e of the travel turns u by e * across / |u|^2.
-        variance = (v_m_s**2 * timing + (self._cfg.slip_fraction * travel) ** 2) * (across / length**2) ** 2
+        per_travel = by_pair.across_m / by_pair.length_m**2
+        variance = (v_m_s**2 * timing + (self._cfg.slip_fraction * travel) ** 2) * per_travel**2
         return HeadingFix(innovation, variance)
 
     def _mark(self, transition: SensorTransition, odometer: Odometer, pose: DeckPose) -> _Mark | None:
@@ -189,6 +199,27 @@ class Edge(NamedTuple):
     is_new: bool
 
 
+class SensorAtEdge(NamedTuple):
+    """A sensor at its transition: place, velocity, and along the axis of the edge the robot's axes h, l, and the lever.
+
+    ``lever_m``: how far a radian of turn moves the sensor along that axis.
+    """
+
+    place_m: tuple[float, float]
+    velocity_m_s: tuple[float, float]
+    forward: float
+    left: float
+    lever_m: float
+
+
+class EdgeMeasurement(NamedTuple):
+    """Residual, m, row (1, n) of the model, and variance, m^2."""
+
+    residual_m: float
+    H: FloatArray
+    variance_m2: float
+
+
 class SeamLines:
     """Uses transitions of the edge sensors as measurements of the position along one axis.
 
@@ -210,15 +241,15 @@ class SeamLines:
 
     def edge_of(self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:
         """The edge of a transition, by the state x (n,) at ``t_s``; None if no seam is near."""
-        place, (along_x, along_y), _ = self._sensor(transition, t_s, x, slope)
-        seam = self._mirror.nearest_seam(*place)
+        sensor = self._sensor(transition, t_s, x, slope)
+        seam = self._mirror.nearest_seam(*sensor.place_m)
         if seam is None or abs(seam.distance_m) > self._reach_m:
             return None
         k = 0 if seam.axis == "x" else 1
-        speed = (along_x, along_y)[k]
+        speed = sensor.velocity_m_s[k]
         # The edge on the high or low side of the seam's centre line, and its panel.
         is_high = (speed > 0.0) is transition.is_on
-        inside = list(place)
+        inside = list(sensor.place_m)
         inside[k] = seam.position_m + (self._half[k] if is_high else -self._half[k])
         panel = self._mirror.panels[self._mirror.nearest_panel(*inside)]
         centre_m = (panel.x_m, panel.y_m)[k]
@@ -231,29 +262,25 @@ class SeamLines:
 
     def line(
         self, edge: Edge, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope
-    ) -> tuple[float, FloatArray, float]:
-        """Measurement by a transition over ``edge``: ``sensor - edge - offset = 0`` along one axis.
-
-        Returns residual, m, row (1, n) of the model, and variance, m^2. Arguments as in ``edge_of``.
-        """
-        place, speeds, (forward, left, lever) = self._sensor(transition, t_s, x, slope, edge.k)
+    ) -> EdgeMeasurement:
+        """Measurement by a transition over ``edge``: ``sensor - edge - offset = 0`` along one axis."""
+        sensor = self._sensor(transition, t_s, x, slope, edge.k)
         late_s = t_s - transition.t_s
         v = float(x[V]) - float(x[A]) * late_s
         H = np.zeros((1, STATES))
         row = H[0]
         row[X + edge.k] = 1.0
-        row[PSI] = lever - v * late_s * left
-        row[V] = -late_s * forward
-        row[A] = late_s * late_s * forward
+        row[PSI] = sensor.lever_m - v * late_s * sensor.left
+        row[V] = -late_s * sensor.forward
+        row[A] = late_s * late_s * sensor.forward
         row[W] = -late_s * row[PSI]
         row[edge.offset] = -1.0
-        variance = (speeds[edge.k] * transition.interval_s) ** 2 * _UNIFORM + _TIMING_FLOOR_M2
-        return edge.position_m + float(x[edge.offset]) - place[edge.k], H, variance
+        variance = (sensor.velocity_m_s[edge.k] * transition.interval_s) ** 2 * _UNIFORM + _TIMING_FLOOR_M2
+        return EdgeMeasurement(edge.position_m + float(x[edge.offset]) - sensor.place_m[edge.k], H, variance)
 
     def _sensor(
         self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope, k: int = 0
-    ) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float]]:
-        """Place (m) and velocity (m/s) of a sensor at its transition, and h, l and lever of a turn along axis k."""
+    ) -> SensorAtEdge:
         late_s = t_s - transition.t_s
         ox, oy = self._sensors[transition.corner]
         x_m, y_m, psi, v, a, w = x[:6].tolist()
@@ -263,4 +290,4 @@ class SeamLines:
         turn_x, turn_y = ox * lx - oy * hx, ox * ly - oy * hy
         place = x_m - v * late_s * hx + ox * hx + oy * lx, y_m - v * late_s * hy + ox * hy + oy * ly
         velocity = v * hx + w * turn_x, v * hy + w * turn_y
-        return place, velocity, ((hx, lx, turn_x) if k == 0 else (hy, ly, turn_y))
+        return SensorAtEdge(place, velocity, *((hx, lx, turn_x) if k == 0 else (hy, ly, turn_y)))

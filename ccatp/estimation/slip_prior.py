@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from math import exp, log
+from typing import NamedTuple
 
 import numpy as np
 
@@ -88,6 +89,31 @@ def _parameters_of(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray
     return _PARAMETERS.dot(mean[SLIPS]), known
 
 
+class LegScatter(NamedTuple):
+    """Variances of a leg's values about their means: mean slip, difference of the slips, creep, creep of turns."""
+
+    slip: float
+    difference: float
+    creep: float
+    turn_creep: float
+
+
+class SlipWander(NamedTuple):
+    """Variances by which the slip of each wheel and both creeps change."""
+
+    slip: float
+    creep: float
+    turn_creep: float
+
+
+class LegTransition(NamedTuple):
+    """From (right slip, left slip, creeps) to the next leg: s' = F s + b + e, with the covariance Q of e."""
+
+    F: FloatArray
+    b: FloatArray
+    Q: FloatArray
+
+
 class SlipPrior:
     """Prior of slip and creep for each leg.
 
@@ -112,10 +138,10 @@ class SlipPrior:
         self._is_open = False
         self._wandered = 0.0  # variance of the mean slip's wander in this leg, as a part of the scatter
 
-    def _learned(self) -> tuple[float, float, float, float]:
+    def _learned(self) -> LegScatter:
         slip, squares = self._slip_scatter.scatter, np.square(self._means[2:]) + self._variances[2:]
         creep, turn_creep = (self._creep_shares * squares).tolist()
-        return slip, _DIFFERENCE * slip, creep, turn_creep
+        return LegScatter(slip, _DIFFERENCE * slip, creep, turn_creep)
 
     def _open(self) -> None:
         self._is_open = True
@@ -125,7 +151,7 @@ class SlipPrior:
     @property
     def scatter(self) -> tuple[float, float]:
         """Learned standard deviations of the mean slip and of the creep from leg to leg."""
-        return self._scatters[0] ** 0.5, self._scatters[2] ** 0.5
+        return self._scatters.slip**0.5, self._scatters.creep**0.5
 
     def first(self) -> tuple[FloatArray, FloatArray]:
         """Prior of (right slip, left slip, creeps) before the first leg: mean (4,), covariance (4, 4)."""
@@ -133,12 +159,8 @@ class SlipPrior:
         means, variances = self._prior
         return _STATES.dot(means), (_STATES * variances).dot(_STATES.T)
 
-    def begin(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Begin a leg from the state at the end of the last one, mean (n,) and covariance (n, n).
-
-        Returns the transition of (right slip, left slip, creeps) to the next leg, s' = F s + b + e: F (4, 4), b (4,),
-        and the covariance (4, 4) of e.
-        """
+    def begin(self, mean: FloatArray, covariance: FloatArray) -> LegTransition:
+        """Begin a leg from the state at the end of the last one, mean (n,) and covariance (n, n)."""
         found, known = _parameters_of(mean, covariance)
         # The gain with which a leg updates m is beta; ``own`` is the variance of m that remains.
         before, self._scatters = self._scatters, self._learned()
@@ -148,13 +170,14 @@ class SlipPrior:
         self._variances = own + beta * beta * known
         self._open()
         F, Q = (_STATES * beta).dot(_PARAMETERS), (_STATES * (own + self._scatters)).dot(_STATES.T)
-        return F, _STATES.dot(self._means) - F.dot(mean[SLIPS]), Q
+        return LegTransition(F, _STATES.dot(self._means) - F.dot(mean[SLIPS]), Q)
 
-    def wander(self, dt_s: float) -> tuple[float, float, float]:
-        """Variances by which slip (of each wheel) and both creeps wander in a step of ``dt_s`` within the leg."""
+    def wander(self, dt_s: float) -> SlipWander:
+        """How slip and creep wander in a step of ``dt_s`` within the leg."""
         per_step = self._wander * dt_s
         self._wandered += per_step
-        return 2.0 * per_step * self._scatters[0], per_step * self._scatters[2], per_step * self._scatters[3]
+        scatter = self._scatters
+        return SlipWander(2.0 * per_step * scatter.slip, per_step * scatter.creep, per_step * scatter.turn_creep)
 
     def end(self, mean: FloatArray, covariance: FloatArray) -> None:
         """End the leg at a fix: learn the scatter from the state after it, (n,) and (n, n)."""
@@ -163,7 +186,7 @@ class SlipPrior:
         self._is_open = False
         found, known = (values.tolist() for values in _parameters_of(mean, covariance))
         means, variances = (values.tolist() for values in self._prior)
-        wander = self._wandered * self._scatters[0]
+        wander = self._wandered * self._scatters.slip
         alone: list[tuple[float, float] | None] = []
         for k, (scale, weight) in enumerate(((1.0, 1.0), (0.5, _DIFFERENCE))):
             before = variances[k] + weight * wander

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ccatp.estimation.localizer_base import SensorTransition
 from ccatp.estimation.odometry import MIN_VARIANCE_RAD2, PreintegratedMotion, Slope, Terrain, WheelAngle, gravity_on
 from ccatp.estimation.rest import ZeroVelocityReading, heading_from_gravity
 from ccatp.estimation.seams import SeamLines
-from ccatp.estimation.slip_prior import SlipPrior
+from ccatp.estimation.slip_prior import SlipPrior, SlipWander
 from ccatp.estimation.wheel_coast import CoastedMotion
 from ccatp.filters.base import Filter, Innovation
 from ccatp.kinematics import difference
@@ -101,7 +102,7 @@ class SurveyFilter:
         body follows the prediction as far as it is certain.
         """
         dt_s = block.dt_s
-        slips = self._legs.wander(block.turning_s) if dt_s > 0.0 else (0.0, 0.0, 0.0)
+        slips = self._legs.wander(block.turning_s) if dt_s > 0.0 else SlipWander(0.0, 0.0, 0.0)
         encoders = self.encoder_walk(right) * dt_s
         readings = []
         # The rate before the angles: after them its variance would be so small that digits are lost.
@@ -356,6 +357,14 @@ class _Entry:
     steps: list[Step] = field(default_factory=list)
 
 
+class PastState(NamedTuple):
+    """A state of the filter, mean (n,) and covariance (n, n), and how much later it is than wanted, s."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    late_s: float
+
+
 class ReplayBuffer:
     """Executes the steps of a filter, and rewinds and replays them for late measurements, at most ``reach_s`` back.
 
@@ -403,11 +412,11 @@ class ReplayBuffer:
             self._entries[-1].steps.append(step)
         step()
 
-    def look(self, t_s: float) -> tuple[FloatArray, FloatArray, float]:
-        """The first state not before ``t_s``: its mean and covariance, and how much later it is, s."""
+    def look(self, t_s: float) -> PastState:
+        """The first state not before ``t_s``."""
         later, late_s = self._since(t_s)
         at = later[0] if later else self._filter
-        return at.mean, at.covariance, late_s
+        return PastState(at.mean, at.covariance, late_s)
 
     def _since(self, t_s: float) -> tuple[list[_Entry], float]:
         """The entries after the first state not before ``t_s``, and the time of motion from ``t_s`` to it, s."""

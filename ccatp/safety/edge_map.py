@@ -24,9 +24,9 @@ class EdgeMap:
         self._rim = mirror.rim
         self.gap_m = mirror.gap_m
 
-    def place(self, pose: tuple[float, float, float], offset_m: Place) -> Place:
-        """Deck (x, y) of a sensor at ``offset_m`` (robot frame) when the robot is at ``pose`` (x, y, heading)."""
-        return self._mirror.body_offset(DeckPose(*pose), *offset_m)
+    def place(self, pose: DeckPose, offset_m: Place) -> Place:
+        """Deck (x, y) of a sensor at ``offset_m`` (robot frame) when the robot is at ``pose``."""
+        return self._mirror.body_offset(pose, *offset_m)
 
     def is_rim_ahead(self, place: Place, direction: Place, reach_m: float, slack_m: float) -> bool:
         """Whether the rim is within ``slack_m`` of the next ``reach_m`` from ``place`` along the unit ``direction``."""

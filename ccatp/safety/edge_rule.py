@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from math import cos, hypot, inf, sin
 
 from ccatp.config.models import DangerConfig, RobotConfig
-from ccatp.core import EdgeSample, WheelSample
+from ccatp.core import DeckPose, EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim
 from ccatp.rest import AT_REST_M_S, WHEEL_STANDS_RAD_S
@@ -148,7 +148,7 @@ class EdgeRule:
         for i, episode in enumerate(self.episodes):
             if episode is None or episode.edge is None or episode.is_on:
                 continue
-            place = self._map.place((estimate.x_m, estimate.y_m, estimate.heading_rad), self._offsets[i])
+            place = self._map.place(_pose_of(estimate), self._offsets[i])
             aside_m = _HEADING_RAD * hypot(*self._offsets[i])
             slack_m = limits.sigmas * estimate.sigma_m + aside_m
             seam = self._map.seam_at(place, limits.tolerance_m + slack_m)
@@ -167,9 +167,8 @@ class EdgeRule:
         estimate: EstimateMessage,
         more_sigma_m: float = 0.0,
     ) -> None:
-        known = estimate.x_m, estimate.y_m, estimate.heading_rad
-        pose = pose_at(self.track, odometry.t_s, estimate.t_s, known)
-        episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m + more_sigma_m)
+        pose = pose_at(self.track, odometry.t_s, estimate.t_s, _pose_of(estimate))
+        episode.place_on_map(self._map.place(pose, offset_m), pose.heading_rad, estimate.sigma_m + more_sigma_m)
 
     def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: EstimateMessage | None) -> EdgeEpisode:
         ox, oy = self._offsets[i]
@@ -189,6 +188,10 @@ class EdgeRule:
         elif self.is_lifted and self._all_on >= self._clear_samples:
             self.is_lifted = False  # put back on the panels
             self.episodes = [None] * SENSORS
+
+
+def _pose_of(estimate: EstimateMessage) -> DeckPose:
+    return DeckPose(estimate.x_m, estimate.y_m, estimate.heading_rad)
 
 
 def _are_all_on(samples: Sequence[EdgeSample]) -> bool:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from math import cos, inf, sin
 from typing import NamedTuple
 
-from ccatp.core import WheelSample
+from ccatp.core import DeckPose, WheelSample
 
 # A frame may be as short as an encoder period.
 HISTORY_FRAMES = 256
@@ -152,16 +152,15 @@ class Odometry:
         self.omega_rad_s = omega_rad_s
 
 
-def pose_at(
-    track: WheelTrack, t_s: float, known_t_s: float, pose: tuple[float, float, float]
-) -> tuple[float, float, float]:
-    """The pose (x, y, heading) at ``t_s`` from ``pose`` at ``known_t_s``, forward or backward along the track."""
+def pose_at(track: WheelTrack, t_s: float, known_t_s: float, pose: DeckPose) -> DeckPose:
+    """The pose at ``t_s`` from ``pose`` at ``known_t_s``, forward or backward along the track."""
     if t_s >= known_t_s:
-        forward = Odometry(track, known_t_s, pose)
+        forward = Odometry(track, known_t_s, (pose.x_m, pose.y_m, pose.heading_rad))
         forward.advance_to(t_s)
-        return forward.x_m, forward.y_m, forward.heading_rad
+        return DeckPose(forward.x_m, forward.y_m, forward.heading_rad)
     back = Odometry(track, t_s)
     back.advance_to(known_t_s)
-    heading = pose[2] - back.heading_rad
+    heading = pose.heading_rad - back.heading_rad
     c, s = cos(heading), sin(heading)
-    return pose[0] - c * back.x_m + s * back.y_m, pose[1] - s * back.x_m - c * back.y_m, heading
+    x_m = pose.x_m - c * back.x_m + s * back.y_m
+    return DeckPose(x_m, pose.y_m - s * back.x_m - c * back.y_m, heading)

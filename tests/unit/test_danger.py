@@ -6,6 +6,7 @@ from typing import Any
 from weakref import ReferenceType, ref
 
 import pytest
+from msgspec.structs import astuple
 
 from ccatp.conditions import (
     BEYOND_SEAM,
@@ -17,7 +18,7 @@ from ccatp.conditions import (
     text_of,
 )
 from ccatp.config.models import Config
-from ccatp.core import Corner, EdgeSample, EventCode, Verdict, WheelSample
+from ccatp.core import Corner, DeckPose, EdgeSample, EventCode, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
@@ -577,15 +578,16 @@ def test_odometry_of_an_arc_forwards_and_backwards() -> None:
     right, left = (v + 0.5 * omega * 0.15) / 0.03, (v - 0.5 * omega * 0.15) / 0.03
     track.push([WheelSample(k * 1e-3, right, left) for k in range(1001)])
     track.update(1.0)
-    start = (1.0, 2.0, 0.3)
+    start = DeckPose(1.0, 2.0, 0.3)
     end = pose_at(track, 0.9004, 0.1003, start)
     # chord of an arc: 2 R sin(angle / 2), R = v / omega
     angle = omega * 0.8001
 
     chord = 2.0 * v / omega * sin(0.5 * angle)
     expected = (1.0 + chord * cos(0.3 + 0.5 * angle), 2.0 + chord * sin(0.3 + 0.5 * angle), 0.3 + angle)
-    assert end == pytest.approx(expected, abs=1e-9)  # midpoint headings over 1 ms are exact to 1e-8 of the path
-    assert pose_at(track, 0.1003, 0.9004, end) == pytest.approx(start, abs=1e-9)
+    # Midpoint headings over 1 ms are exact to 1e-8 of the path.
+    assert astuple(end) == pytest.approx(expected, abs=1e-9)
+    assert astuple(pose_at(track, 0.1003, 0.9004, end)) == pytest.approx(astuple(start), abs=1e-9)
 
 
 def test_odometry_interpolates_and_then_holds_the_velocity() -> None:

@@ -5,10 +5,11 @@ from math import cos, hypot, pi, sin
 from typing import Any, cast
 
 import pytest
+from msgspec.structs import astuple
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import EdgeSample, WheelSample
+from ccatp.core import DeckPose, EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim
 from ccatp.safety.edge_episode import EdgeEpisode, EdgePhase
@@ -137,7 +138,8 @@ def test_an_estimate_of_the_past_is_carried_to_the_sample(rule: Rule) -> None:
     for _ in range(14):
         rule.feed([ON] * 10, v=0.1)
     rule.feed([OFF_FL] * 10, v=0.1, estimate=rule.estimate(age_s=0.1))
-    (x_m, y_m, heading_rad), offset_m = rule.map.placed[0]
+    pose, offset_m = rule.map.placed[0]
+    x_m, y_m, heading_rad = astuple(pose)
     # The estimate of 0.1 s before the frame, and a millisecond to the first sample off.
     way_m = 0.1 * 0.101
     assert (x_m, y_m) == pytest.approx((1.0 + way_m * cos(0.5), 2.0 + way_m * sin(0.5)), abs=1e-6)
@@ -284,7 +286,7 @@ def test_the_map_is_asked_with_the_slack_of_fix_and_heading(rule: Rule, cfg: Con
     slack_m = cfg.danger.map_sigmas * 4e-4 + aside_m
     assert rule.map.slacks_m == [pytest.approx(cfg.danger.gap_tolerance_m + slack_m)]
     assert rule.map.rims == [((5.0, 6.0), (1.0, 0.0), 0.0, pytest.approx(cfg.danger.map_margin_m + slack_m))]
-    assert rule.map.placed[-1] == ((1.0, 2.0, 0.5), cfg.robot.edge_sensors_m[0])
+    assert rule.map.placed[-1] == (DeckPose(1.0, 2.0, 0.5), cfg.robot.edge_sensors_m[0])
     rule.map.seam = SEAM
     declared(rule, 0.01)
     anew = measured(rule, 4e-4, v=4e-4)  # how late it was noticed has no part in it
