@@ -40,7 +40,7 @@ from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.composition import SurveyParts, assemble
-from ccatp.survey.events import DONE, FixFailed, FixStored, MissionState, PointMissed, SurveyOutcome
+from ccatp.survey.events import DONE, FixFailed, FixStored, Mode, PointMissed, SurveyOutcome
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.statechart import Mission
@@ -213,7 +213,7 @@ class SilRun:
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
         self.laser = SilLaser(cfg, self.mirror, self.robot)
         self.trace = SilTrace(parts)
-        self.states_s = defaultdict(float, {MissionState.IDLE: 0.0})
+        self.states_s = defaultdict(float, {Mode.IDLE: 0.0})
         self.denied_s: list[float] = []  # when lines that were no frames took the permit away
         self.weak_frames = 0  # on an overhang, in which the fans gave less than their floor
         self._published: EstimateMessage | None = None

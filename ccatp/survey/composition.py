@@ -21,7 +21,7 @@ from ccatp.links.robot_messages import Hello
 from ccatp.localizer import Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.rest import ALMOST_AT_REST_M_S, ALMOST_AT_REST_RAD_S
-from ccatp.survey.events import HELD, IDLE, MEASURING, SETTLING, MissionState, TakenOver
+from ccatp.survey.events import HELD, IDLE, MEASURING, SETTLING, Mode, TakenOver
 from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner
 from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
@@ -33,7 +33,7 @@ RADIUS_TOLERANCE = 0.05
 SENSOR_TOLERANCE_M = 0.005
 
 # Modes in which the robot is told to stand.
-_STANDING = (IDLE, SETTLING, MEASURING, HELD, MissionState.DONE)
+_STANDING = (IDLE, SETTLING, MEASURING, HELD, Mode.DONE)
 # Standard deviations for a robot that stood: it may have crept, or somebody may have touched it.
 _STOOD_M, _STOOD_RAD = 0.005, 0.01
 # Unobserved motion: the checkpoint is up to 0.1 s old, the last command lasts for 0.25 s, the wheels run down in 0.1 s.

@@ -12,7 +12,7 @@ from ccatp.missions import SEARCHED
 M = TypeVar("M", bound=StrEnum)
 
 
-class MissionState(StrEnum):
+class Mode(StrEnum):
     """Mode of a mission. Another kind of mission may have modes of its own, in which it may be held or end."""
 
     IDLE = "idle"
@@ -26,7 +26,7 @@ class MissionState(StrEnum):
     DONE = "done"
 
 
-IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE = MissionState
+IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE = Mode
 MOVES = "stands for a moment before the move or until the danger loop permits it, then goes on by itself"
 # What a robot waits for that stands in a mode while nothing is wrong, and what happens then.
 WAITS_FOR = MappingProxyType(
@@ -73,7 +73,7 @@ _SURVEYING = _ANYWHERE | {
 }
 _STOPPING = {MissionEvent.ARRIVED: SETTLING, MissionEvent.FIND: SETTLING}
 # (state, event) -> state. An edge precedes an abort: while backing off, GO_HOME has no effect. DONE is final.
-TRANSITIONS: Mapping[StrEnum, Mapping[MissionEvent, MissionState]] = MappingProxyType(
+TRANSITIONS: Mapping[StrEnum, Mapping[MissionEvent, Mode]] = MappingProxyType(
     {
         IDLE: _SURVEYING | {MissionEvent.FIND: SETTLING},
         TURNING: _SURVEYING | _STOPPING | {MissionEvent.TURNED: DRIVING},
@@ -102,7 +102,7 @@ PURPOSES = MappingProxyType(
 )
 
 
-def next_state(state: M, event: MissionEvent) -> M | MissionState:
+def next_state(state: M, event: MissionEvent) -> M | Mode:
     """The state after ``event``; total over all pairs."""
     return TRANSITIONS.get(state, _ANYWHERE).get(event, state)
 
@@ -110,7 +110,7 @@ def next_state(state: M, event: MissionEvent) -> M | MissionState:
 def waits_for(state: str) -> str:
     """What a robot waits for that stands in a mode of any mission while nothing is wrong; empty: it is not known."""
     if state in WAITS_FOR:
-        return WAITS_FOR[MissionState(state)]
+        return WAITS_FOR[Mode(state)]
     return next((kind.waits[state] for kinds in SEARCHED for kind in kinds() if state in kind.waits), "")
 
 

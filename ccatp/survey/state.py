@@ -27,7 +27,7 @@ from ccatp.survey.events import (
     Fault,
     Interrupted,
     MissionEvent,
-    MissionState,
+    Mode,
     Pause,
     Resume,
     StopHere,
@@ -109,7 +109,7 @@ class HoldState(msgspec.Struct, frozen=True):
 class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
     """The state of a survey."""
 
-    mode: MissionState = IDLE
+    mode: Mode = IDLE
 
     route: Route
     stop_index: int = 0  # of the stop driven to, or measured at

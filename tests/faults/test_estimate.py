@@ -18,7 +18,7 @@ from ccatp.core import Twist
 from ccatp.daemon.loops.mission_runner import DriveCommand
 from ccatp.links.robot_messages import Sensors
 from ccatp.studies.sil_run import SilRun
-from ccatp.survey.events import FixStored, MissionState
+from ccatp.survey.events import FixStored, Mode
 from tests.faults.linking import Measured
 from tests.support.scenario import config_of, one_panel
 from tests.support.sim_survey import MeasuredSurvey, RestartedSurvey
@@ -71,7 +71,7 @@ class Broken(MeasuredSurvey):
         self.drive = drive.right_rad_s, drive.left_rad_s
 
     def look(self, frame: Sensors) -> None:
-        if self.broken_at_s is None and self.mission.state.done and self.mission.state.mode is MissionState.DRIVING:
+        if self.broken_at_s is None and self.mission.state.done and self.mission.state.mode is Mode.DRIVING:
             self.broken_at_s = frame.t
             localizer: Any = self.localizer
             # The end of a block of frames: the filter is asked in this one.
@@ -85,8 +85,8 @@ class Broken(MeasuredSurvey):
             self.held_at_s = frame.t
             assert text_of(self.mission.state.cause).startswith("filter: ")
             assert self.mission.state.mode in (
-                MissionState.HELD,
-                MissionState.SETTLING,
+                Mode.HELD,
+                Mode.SETTLING,
             )  # for a fix, and for nothing else
             assert self.mission.state.measuring_point is None
             assert self.drive == (0.0, 0.0)
@@ -193,7 +193,7 @@ class Burning(RestartedSurvey):
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         is_time = frame.seq > 1000 if self._is_before else bool(self.states)
-        if not self._is_raised and is_time and self.mission.state.mode is MissionState.DRIVING:
+        if not self._is_raised and is_time and self.mission.state.mode is Mode.DRIVING:
             assert self.monitor.emergency("fire", "a") is None
             self._is_raised = True
             self._kills |= {frame.seq + 60} if self._is_before else set()
@@ -205,7 +205,7 @@ class Burning(RestartedSurvey):
 def test_whoever_takes_over_in_a_fire_finds_the_heading_and_goes_home(is_before: bool) -> None:
     run = Burning(restarted(1, mission__calibration_length_m=0.0), is_before=is_before)
     result = run.run()
-    assert (run.states == [MissionState.RETURNING]) is is_before
+    assert (run.states == [Mode.RETURNING]) is is_before
     assert len(run.states) == 1
     assert (result.outcome, result.cause) == ("aborted, at base", "emergency: fire")
     assert run.pipeline.gate.denied[Denial.ABORTED] == 0  # it drove to find its heading, too
@@ -239,5 +239,5 @@ class Watching(RestartedSurvey):
 def test_nothing_moves_before_it_is_found() -> None:
     rehearsal = Watching(restarted(1, mission__calibration_length_m=0.0), {350})
     check(rehearsal)
-    assert rehearsal.states[0] in (MissionState.TURNING, MissionState.DRIVING)
+    assert rehearsal.states[0] in (Mode.TURNING, Mode.DRIVING)
     assert rehearsal.early == []

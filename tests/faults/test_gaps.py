@@ -5,7 +5,7 @@ from itertools import pairwise, product
 import pytest
 
 from ccatp.core import Severity
-from ccatp.survey.events import MissionState
+from ccatp.survey.events import Mode
 from tests.faults.linking import Measured
 from tests.support.scenario import one_panel
 from tests.support.sim_survey import Seen, watched
@@ -40,7 +40,7 @@ def worst_arrival_mm(at_s: float, for_s: float, *faults: str) -> float:
 
 def has_measured(seen: list[Seen]) -> bool:
     modes = [one.state for one in seen]
-    return any(a is MissionState.MEASURING and b is not a for a, b in pairwise([*modes, None]))
+    return any(a is Mode.MEASURING and b is not a for a, b in pairwise([*modes, None]))
 
 
 @pytest.mark.fault("S30")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ccatp.conditions import text_of
 from ccatp.control.gate import FanGate
 from ccatp.core import Severity
-from ccatp.survey.events import MissionState, SurveyOutcome
+from ccatp.survey.events import Mode, SurveyOutcome
 from tests.faults.linking import Measured
 from tests.support.scenario import one_panel
 from tests.support.sim_survey import Seen, Watched, watched
@@ -64,7 +64,7 @@ def slow(one: Seen) -> bool:
 
 
 def is_moving(one: Seen) -> bool:
-    return one.state in (MissionState.DRIVING, MissionState.TURNING)
+    return one.state in (Mode.DRIVING, Mode.TURNING)
 
 
 def steps_m(seen: list[Seen]) -> list[float]:
@@ -77,7 +77,7 @@ def error_m(one: Seen) -> float:
     return hypot(one.estimate[0] - one.pose.x_m, one.estimate[1] - one.pose.y_m)
 
 
-def entered(seen: list[Seen], state: MissionState, before: MissionState | None = None) -> int:
+def entered(seen: list[Seen], state: Mode, before: Mode | None = None) -> int:
     """How often a state began, after one or after any other."""
     pairs = [(a.state, b.state) for a, b in pairwise(seen)]
     return sum(b is state and a is not state and before in (None, a) for a, b in pairs)
@@ -86,9 +86,9 @@ def entered(seen: list[Seen], state: MissionState, before: MissionState | None =
 def test_the_times_are_what_they_are_called() -> None:
     run = watched(HARD, after(10.0))
     at = {t_s: run.first(t_s, lambda _: True) for t_s in (DRIVING_S, BRAKING_S, TURNING_S, STANDING_S)}
-    assert at[DRIVING_S].state is at[BRAKING_S].state is MissionState.DRIVING
+    assert at[DRIVING_S].state is at[BRAKING_S].state is Mode.DRIVING
     assert min(map(abs, at[DRIVING_S].drive)) > 3.0 > abs(at[BRAKING_S].drive[0]) > 0.5
-    assert at[TURNING_S].state is MissionState.TURNING
+    assert at[TURNING_S].state is Mode.TURNING
     assert at[STANDING_S].is_zero
     assert all(one.verdict.severity is Severity.NONE for one in run.since(0.1))
 
@@ -143,7 +143,7 @@ def test_it_stops_in_time(case: Stop, measured: Measured) -> None:
         assert run.mission.state.is_faulted
         assert expected.get("cause", "") in text_of(run.mission.state.cause)
         fewest, most = expected.get("holds", (0, inf))
-        assert fewest <= entered(run.seen, MissionState.HELD) <= most
+        assert fewest <= entered(run.seen, Mode.HELD) <= most
         assert run.first(at_s, held(HOLD)).t_s - at_s < expected.get("hold_s", inf)
         assert not run.robot.world.is_fallen
         assert run.robot.fans.duty == (1.0, 1.0) or row != "S25"
@@ -214,10 +214,10 @@ def test_a_wheel_that_slips_holds_and_a_fix_follows(factor: float, measured: Mea
     run = watched(HARD, after(DRIVING_S + 6.0), f"right_wheel slip at_s={DRIVING_S} for_s=1.0 factor={factor}")
     first = run.first(DRIVING_S, held(HOLD))
     assert first.verdict.signal == "imu_wz"
-    assert any(one.state is MissionState.MEASURING for one in run.since(first.t_s))
+    assert any(one.state is Mode.MEASURING for one in run.since(first.t_s))
     assert run.way_m(DRIVING_S, first.t_s) < 0.05
     before = [one for one in run.since(DRIVING_S) if one.t_s < first.t_s]
-    measured("S6", float(entered(before, MissionState.MEASURING, MissionState.SETTLING)))
+    measured("S6", float(entered(before, Mode.MEASURING, Mode.SETTLING)))
 
 
 @pytest.mark.fault("S7")
@@ -249,7 +249,7 @@ def test_an_inertial_unit_that_repeats_itself_is_not_used(fault: str, measured: 
     first = run.first(DRIVING_S, slow)
     assert first.t_s - DRIVING_S <= 0.2 + 0.011  # and a frame on the link
     assert run.localizer.counts["imu_doubted"] > 50
-    driven = [one for one in run.since(DRIVING_S + 1.0) if one.state is MissionState.DRIVING]
+    driven = [one for one in run.since(DRIVING_S + 1.0) if one.state is Mode.DRIVING]
     assert all(0.015 * abs(sum(one.drive)) < 0.07 for one in driven)  # on it goes, slowly
     measured("S9", 1e3 * (first.t_s - DRIVING_S))
 
@@ -273,7 +273,7 @@ def test_an_edge_sensor_that_stays_off_is_no_edge(corner: str, measured: Measure
     first = run.first(DRIVING_S, held(HOLD))
     assert first.verdict.signal == corner
     assert first.t_s - DRIVING_S <= 3.0
-    assert entered(run.seen, MissionState.BACKING_OFF) <= 2
+    assert entered(run.seen, Mode.BACKING_OFF) <= 2
     assert run.mission.state.is_faulted
     assert not run.robot.world.is_fallen
     measured("S18", first.t_s - DRIVING_S)
@@ -294,10 +294,10 @@ def test_a_robot_put_elsewhere_is_found_at_the_next_point(measured: Measured) ->
     fault = f"body kidnap at_s={DRIVING_S} dx_m=-0.03 dy_m=0.02 dheading_rad=0.0"
     run = watched(HARD, after(25.0), fault)
     assert run.injected[0].samples == 1
-    assert len({one.estimate for one in run.seen if one.state is MissionState.MEASURING}) > 1
+    assert len({one.estimate for one in run.seen if one.state is Mode.MEASURING}) > 1
     found = run.first(DRIVING_S + 0.1, lambda one: error_m(one) < 0.005)
     before = [one for one in run.since(DRIVING_S) if one.t_s < found.t_s]
-    stops = entered(before, MissionState.MEASURING, MissionState.SETTLING)
+    stops = entered(before, Mode.MEASURING, Mode.SETTLING)
     assert stops <= 1
     measured("S28", float(stops))
 
@@ -306,7 +306,7 @@ def test_a_robot_put_elsewhere_is_found_at_the_next_point(measured: Measured) ->
 @pytest.mark.parametrize("fault", ["soc stuck value=0.2", 'faults raise names=["battery_low"]'])
 def test_a_low_battery_sends_the_robot_home(fault: str, measured: Measured) -> None:
     run = watched(HARD, to_its_end, f"{fault} at_s=3.0")
-    home = run.first(3.0, lambda one: one.state is MissionState.RETURNING)
+    home = run.first(3.0, lambda one: one.state is Mode.RETURNING)
     assert home.t_s - 3.0 < 5.5
     assert run.mission.state.outcome is SurveyOutcome.AT_BASE
     # The stand-in's charge stays what it was, so this is what is left at base, too.
@@ -343,7 +343,7 @@ def test_numbers_that_are_none_never_reach_the_filter(token: str, measured: Meas
     assert first.is_zero
     assert first.verdict.severity is HOLD
     assert all(abs(x) < 10.0 for one in run.seen for x in one.estimate)
-    assert any(one.state is MissionState.MEASURING for one in run.since(first.t_s))
+    assert any(one.state is Mode.MEASURING for one in run.since(first.t_s))
     moved = [one.t_s for one in run.since(DRIVING_S) if one.t_s < first.t_s and not one.is_zero]
     measured("S4", 1e3 * (max(moved, default=DRIVING_S) - DRIVING_S))
 
@@ -358,7 +358,7 @@ def test_three_lines_that_are_no_frames_within_a_tenth_of_a_second_hold(measured
     first = run.first(DRIVING_S, held(HOLD))
     assert text_of(first.verdict.cause) == "lines of the robot were no frames"
     assert first.is_zero
-    assert any(one.state is MissionState.MEASURING for one in run.since(first.t_s))
+    assert any(one.state is Mode.MEASURING for one in run.since(first.t_s))
     measured("S4", 1e3 * (run.denied_s[0] - DRIVING_S))
 
 
@@ -470,7 +470,7 @@ def test_a_fan_that_gives_too_little_holds_with_full_fans(fault: str, measured: 
 @pytest.mark.fault("F2")
 def test_fans_that_get_weaker_send_the_robot_home_in_time(measured: Measured) -> None:
     run = with_fans(OVERHANG, "fans wrong factor=0.91")
-    assert run.seen[-1].state is MissionState.RETURNING
+    assert run.seen[-1].state is Mode.RETURNING
     assert run.robot.fans.duty == (1.0, 1.0)
     measured("F2", 0.91 * OVERHANG.robot.fan_duty[0] / OVERHANG.sim.robot.fan_floor)
 

@@ -23,7 +23,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck
-from ccatp.survey.events import MissionState
+from ccatp.survey.events import Mode
 from ccatp.survey.fix_gate import SIGNED_AXES, FixGate, FrameCheck, explain
 from tests.contract.test_etalon_client import (
     CHANNELS,
@@ -99,7 +99,7 @@ def test_points_that_fail(
         assert run.mission.state.done[-1] == failures[0].point or why  # when all others were done
     else:
         assert run.mission.state.is_faulted
-        assert run.mission.state.mode is MissionState.HELD
+        assert run.mission.state.mode is Mode.HELD
         assert result.cause == "3 measurements in a row failed: no reply"
 
 
@@ -421,7 +421,7 @@ def test_a_mission_in_a_wrong_frame_does_not_begin(tmp_path: Path) -> None:
         "the laser system sees the robot 0.30 m from its base: no exchange of axes or units explains it; is it at "
         "base, and is this the mirror?"
     )
-    assert not run.states_s.get(MissionState.DRIVING, 0.0)
+    assert not run.states_s.get(Mode.DRIVING, 0.0)
     assert len(run.asked) == 1
 
 
@@ -459,9 +459,9 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(
             async with serving(service):
                 done = 0
                 for _ in range(6000):
-                    if story.state.mode is MissionState.DONE:
+                    if story.state.mode is Mode.DONE:
                         break
-                    if story.state.mode is MissionState.MEASURING and rng.random() < 0.012:
+                    if story.state.mode is Mode.MEASURING and rng.random() < 0.012:
                         story.v, bumps = 0.02, bumps + 1
                     if abs(story.v) > cfg.control.settle_speed_m_s:
                         motion_s.append(story.t)
@@ -474,7 +474,7 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(
                         done, counted = len(story.state.done), counted + 1
                         begun_s, taken_s = fused[-1]
                         moving += any(begun_s - 0.2 <= t <= taken_s for t in motion_s)
-                assert story.state.mode is MissionState.DONE
+                assert story.state.mode is Mode.DONE
 
     for seed in range(2):
         run_virtual(race(seed))

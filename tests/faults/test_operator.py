@@ -38,7 +38,7 @@ from ccatp.survey.events import (
     Abort,
     EmergencyKnown,
     Fault,
-    MissionState,
+    Mode,
     Pause,
     Resume,
 )
@@ -66,7 +66,7 @@ def story(config: Config, mirror: Mirror) -> Story:
 class Aborted(MeasuredSurvey):
     """An emergency in a given state of the mission, and how long it took until the wheels were told to stand."""
 
-    def __init__(self, cfg: Config, folder: Path, state: MissionState, kind: str, clear_after_s: float = inf) -> None:
+    def __init__(self, cfg: Config, folder: Path, state: Mode, kind: str, clear_after_s: float = inf) -> None:
         super().__init__(cfg, folder)
         self._at, self._kind, self._clear_after_s = state, kind, clear_after_s
         self.raised_s = self.zero_s = self.cleared_s = inf
@@ -97,8 +97,8 @@ class Aborted(MeasuredSurvey):
 
 
 @pytest.mark.fault("O1")
-@pytest.mark.parametrize("state", [DRIVING, TURNING, MissionState.MEASURING])
-def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: Path, measured: Measured) -> None:
+@pytest.mark.parametrize("state", [DRIVING, TURNING, Mode.MEASURING])
+def test_a_fire_stops_the_wheels_and_leads_home(state: Mode, tmp_path: Path, measured: Measured) -> None:
     run = Aborted(one_panel(run__seed=3), tmp_path, state, "fire")
     result = run.run()
     measured("O1", 1e3 * (run.zero_s - run.raised_s))
@@ -113,7 +113,7 @@ def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: P
 @pytest.mark.fault("O1")
 @pytest.mark.parametrize("state", [DRIVING, TURNING])
 def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
-    state: MissionState, tmp_path: Path, measured: Measured
+    state: Mode, tmp_path: Path, measured: Measured
 ) -> None:
     run = Aborted(one_panel(run__seed=3, run__mirror="fyst-m2"), tmp_path, state, "earthquake", clear_after_s=5.0)
     result = run.run()
@@ -137,7 +137,7 @@ def emergency(raised: int, kind: str = "fire", *, code: EventCode = EventCode.AB
     return replace(verdict, is_shaking=is_shaking, forward=free, reverse=free, turn=free)
 
 
-def frames(story: Story, *verdicts: Verdict, count: int = 1) -> MissionState:
+def frames(story: Story, *verdicts: Verdict, count: int = 1) -> Mode:
     """The state after these verdicts, ``count`` times."""
     for verdict in verdicts * count:
         story.frame(verdict)

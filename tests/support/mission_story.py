@@ -12,7 +12,7 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
-from ccatp.survey.events import FixStored, MissionState
+from ccatp.survey.events import FixStored, Mode
 from ccatp.survey.planning.route import Route, RoutePlanner
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import SurveyState
@@ -102,14 +102,14 @@ class Story:
 
     def drive_on(self) -> None:
         """Until it is at speed on a leg."""
-        self.until(lambda: self.state.mode is MissionState.DRIVING and self.v > 0.09)
+        self.until(lambda: self.state.mode is Mode.DRIVING and self.v > 0.09)
 
     def finish(self) -> None:
         """The rest of the survey: it is complete."""
-        self.until_state(MissionState.DONE)
+        self.until_state(Mode.DONE)
         assert [p.point for p in self.state.done] == [1, 2, 3]
 
-    def until_state(self, state: MissionState, verdict: Verdict | None = FREE) -> None:
+    def until_state(self, state: Mode, verdict: Verdict | None = FREE) -> None:
         self.until(lambda: self.state.mode is state, verdict)
 
 

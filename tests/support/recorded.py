@@ -34,7 +34,7 @@ from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.survey.behaviours import MissionCommand
-from ccatp.survey.events import Abort, MissionState
+from ccatp.survey.events import Abort, Mode
 from ccatp.survey.route_follower import StateEstimate
 from tests.support.sim_survey import MeasuredSurvey
 
@@ -99,7 +99,7 @@ class RecordingRun(MeasuredSurvey):
         self.track: list[tuple[Any, ...]] = []
         self.truth: list[tuple[Any, ...]] = []
         self.lines: list[msgspec.Raw] = []
-        self.seq, self.t_s, self.seen = 0, 0.0, MissionState.IDLE
+        self.seq, self.t_s, self.seen = 0, 0.0, Mode.IDLE
 
     def leave(self) -> Path:
         """Drive it, and close everything as the daemon does at its end."""

@@ -29,7 +29,7 @@ from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import Checkpoint, SurveyParts, take_over
-from ccatp.survey.events import Fault, FixFailed, FixStored, MissionState, SurveyInput, TakenOver
+from ccatp.survey.events import Fault, FixFailed, FixStored, Mode, SurveyInput, TakenOver
 from ccatp.survey.fix_gate import FixGate, nis_of
 from ccatp.survey.laser_follow import LaserFollow
 from tests.support.virtual_time import VirtualLoop
@@ -63,7 +63,7 @@ class Seen(NamedTuple):
 
     t_s: float
     verdict: Verdict
-    state: MissionState
+    state: Mode
     drive: tuple[float, float]
     pose: DeckPose
     estimate: tuple[float, float]
@@ -371,7 +371,7 @@ class RestartedSurvey(SilRun):
         super().__init__(cfg)
         self._kills = kills
         self._checkpoint = b""
-        self.states: list[MissionState] = []
+        self.states: list[Mode] = []
         self.first_moves_m: list[float] = []
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:

@@ -11,7 +11,7 @@ from ccatp.links.topics import EstimateMessage, TreatmentKind
 from ccatp.sensing.wheel_means import as_standing
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.composition import SurveyParts
-from ccatp.survey.events import HELD, EstimateDiverged, MissionState
+from ccatp.survey.events import HELD, EstimateDiverged, Mode
 from ccatp.survey.route_follower import StateEstimate
 
 
@@ -113,7 +113,7 @@ class SurveyPipeline:
             self._sink.execute(command, motion)
         if frame.is_estimate_due:
             self._sent_commands = self.sent.take_span(), self.sent.newest
-            turns = state.mode is not MissionState.DRIVING
+            turns = state.mode is not Mode.DRIVING
             is_measured = bool(self.thrust.friction)
             if self.parts.measure_grip() and not is_measured:
                 self._sink.report_grip()

@@ -32,7 +32,7 @@ from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.composition import SurveyParts
-from ccatp.survey.events import Abort, Fault, MissionState, SurveyOutcome, TrackingGap
+from ccatp.survey.events import Abort, Fault, Mode, SurveyOutcome, TrackingGap
 from ccatp.survey.fix_gate import FixGate
 from ccatp.survey.laser_follow import LaserFollow
 from ccatp.survey.route_follower import StateEstimate
@@ -40,11 +40,11 @@ from ccatp.survey.state import by_reason
 from ccatp.survey.statechart import Mission
 
 
-def state_text(state: MissionState, cause: str) -> str:
+def state_text(state: Mode, cause: str) -> str:
     """Text about a hold, or about the state after it."""
     if cause:
         return f"{state}: {cause}"
-    is_end = state in (MissionState.HELD, MissionState.BACKING_OFF, MissionState.DONE)
+    is_end = state in (Mode.HELD, Mode.BACKING_OFF, Mode.DONE)
     return f"{state}" if is_end else f"resumed: {state}"
 
 
@@ -79,7 +79,7 @@ class SurveyRunner(MissionRunner):
         self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
-        self._state = MissionState.IDLE
+        self._state = Mode.IDLE
         self._has_reported_calibration = False
 
     @property
@@ -294,11 +294,11 @@ class SurveyRunner(MissionRunner):
         if not state.is_faulted:
             self._fault_timer.over()
         telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode, cause=text_of(state.cause))
-        if mode in (MissionState.HELD, MissionState.BACKING_OFF) or before is MissionState.HELD:
+        if mode in (Mode.HELD, Mode.BACKING_OFF) or before is Mode.HELD:
             telemetry.notify_operator("warning", state_text(mode, text_of(state.cause)))
-        if mode is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
+        if mode is Mode.RETURNING and before is not Mode.BACKING_OFF:
             telemetry.notify_operator("warning", f"returning to base: {text_of(state.cause)}")
-        if mode is MissionState.DONE:
+        if mode is Mode.DONE:
             self._host.finish(EXIT_STATUS[state.outcome])
         elif state.is_faulted and self._host.is_lockstep:
             # No operator can react while simulated time runs at many times the wall clock.

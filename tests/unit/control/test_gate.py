@@ -14,7 +14,7 @@ from ccatp.control.gate import Denial, DriveGate, FanGate, Purpose
 from ccatp.core import EventCode, Twist, Verdict
 from ccatp.daemon.loops.gate_log import GateLog
 from ccatp.kinematics import twist_of, wheel_rates
-from ccatp.survey.events import PURPOSES, MissionState
+from ccatp.survey.events import PURPOSES, Mode
 from tests.support.scenario import config_of
 
 LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.8, alpha_max_rad_s2=2.0)
@@ -105,9 +105,9 @@ def test_what_is_denied_and_why(
 
 
 def test_every_state_has_a_purpose_and_those_that_stand_deny() -> None:
-    assert set(PURPOSES) == set(MissionState)
+    assert set(PURPOSES) == set(Mode)
     moving = {state for state, purpose in PURPOSES.items() if denial(SLOW, purpose=purpose) is None}
-    assert moving == {MissionState.TURNING, MissionState.DRIVING, MissionState.BACKING_OFF, MissionState.RETURNING}
+    assert moving == {Mode.TURNING, Mode.DRIVING, Mode.BACKING_OFF, Mode.RETURNING}
     assert denial(SLOW, purpose=Purpose.STAND) is Denial.STATE
 
 

@@ -35,7 +35,7 @@ from ccatp.survey.events import (
     Fault,
     FixFailed,
     FixStored,
-    MissionState,
+    Mode,
     Pause,
     StopHere,
     SurveyOutcome,
@@ -123,7 +123,7 @@ FIX = Fix(1.0, (0.0, 0.0, 0.0), tuple(np.eye(3).ravel().tolist()), 1.0, (1, 2, 3
 def driving(config: Config) -> Story:
     cfg = from_first_leg(config)
     story = Story(cfg, build_mirror(cfg.mirror))
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     return story
 
 
@@ -168,11 +168,11 @@ def test_what_was_stopped_on_its_way_home_goes_home_when_it_continues(driving: S
     assert driving.mission.handle(Abort(Cause("operator"))) is None
     assert driving.mission.handle(StopHere()) is None
     after = taken_over(driving, is_new_run=True)
-    assert (in_force(after), after.mode) == (("operator", ""), MissionState.IDLE)
+    assert (in_force(after), after.mode) == (("operator", ""), Mode.IDLE)
 
 
 def test_what_is_at_base_has_nothing_in_force(driving: Story) -> None:
-    driving.until_state(MissionState.DONE, ABORT)
+    driving.until_state(Mode.DONE, ABORT)
     after = taken_over(driving, is_new_run=True)
     assert (in_force(after), after.emergency_epoch, after.outcome) == (("", ""), 0, SurveyOutcome.NONE)
     assert in_force(taken_over(driving)) == ("emergency: fire", "")  # died there: it is not another survey
@@ -252,10 +252,10 @@ class Doomed(Story):
 def test_a_point_is_retried_once_however_often_main_is_killed(config: Config, seed: int) -> None:
     cfg = from_first_leg(config)
     alone = Doomed(cfg, set())
-    alone.until_state(MissionState.DONE)
+    alone.until_state(Mode.DONE)
     assert [point.point for point in alone.tries] == [1, 2, 3, 2]
     killed = Doomed(cfg, set(random.Random(seed).sample(range(1, 2 * alone.frames), 6)))
-    killed.until(lambda: killed.mission.state.mode is MissionState.DONE, frames=20_000)
+    killed.until(lambda: killed.mission.state.mode is Mode.DONE, frames=20_000)
     here, there = killed.mission.state, alone.mission.state
     assert (here.done, here.skipped, here.outcome) == (there.done, there.skipped, there.outcome)
     assert here.failure_causes == there.failure_causes
@@ -285,7 +285,7 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     restarted, store = build(replace(where, is_restarted=True))
     store.close()
     state = restarted.mission.state
-    assert (state.mode, text_of(state.cause), state.is_faulted) == (MissionState.HELD, "a wheel is blocked", True)
+    assert (state.mode, text_of(state.cause), state.is_faulted) == (Mode.HELD, "a wheel is blocked", True)
     assert (state.done, state.skipped, state.budget.before_s) == ((one,), (two,), 12.5)
     assert state.failure_causes == {two: "no lengths", three: "no time for it"}
     assert len({stop.point for stop in state.route.stops} - {None}) == 6
@@ -297,7 +297,7 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     resumed, store = build(replace(where, is_resuming=True, is_held=True))
     store.close()
     state = resumed.mission.state
-    assert (state.mode, text_of(state.cause), state.is_faulted) == (MissionState.HELD, "a wheel is blocked", False)
+    assert (state.mode, text_of(state.cause), state.is_faulted) == (Mode.HELD, "a wheel is blocked", False)
     assert (state.done, state.skipped, state.failure_causes, state.budget.before_s) == ((one,), (), {}, 0.0)
     assert len({stop.point for stop in state.route.stops} - {None}) == 8
 
@@ -382,16 +382,16 @@ def test_a_checkpoint_of_an_older_format_is_refused(driving: Story, tmp_path: Pa
 @pytest.mark.parametrize(
     ("state", "v", "omega", "sigmas"),
     [
-        (MissionState.SETTLING, 0.0, 0.0, (0.005, 0.010)),
-        (MissionState.HELD, 0.0019, -0.0099, (0.005, 0.010)),
-        (MissionState.HELD, -0.002, 0.0, (0.0110, 0.0905)),
-        (MissionState.HELD, 0.0, 0.01, (0.0103, 0.0950)),
-        (MissionState.DRIVING, 0.0, 0.0, (0.0103, 0.0905)),
-        (MissionState.DRIVING, -0.1, 0.5, (0.0542, 0.3152)),
+        (Mode.SETTLING, 0.0, 0.0, (0.005, 0.010)),
+        (Mode.HELD, 0.0019, -0.0099, (0.005, 0.010)),
+        (Mode.HELD, -0.002, 0.0, (0.0110, 0.0905)),
+        (Mode.HELD, 0.0, 0.01, (0.0103, 0.0950)),
+        (Mode.DRIVING, 0.0, 0.0, (0.0103, 0.0905)),
+        (Mode.DRIVING, -0.1, 0.5, (0.0542, 0.3152)),
     ],
 )
 def test_a_robot_that_was_not_observed_may_be_elsewhere(
-    driving: Story, state: MissionState, v: float, omega: float, sigmas: tuple[float, float]
+    driving: Story, state: Mode, v: float, omega: float, sigmas: tuple[float, float]
 ) -> None:
     survey_state = structs.replace(driving.mission.state, mode=state)
     found = Checkpoint(1, 1, 0.01, 0.01, DeckPose(0.0, 0.0, 0.0), 1e-4, 1e-3, v, omega, survey_state)

@@ -21,7 +21,7 @@ from ccatp.daemon.operator.terminal import next_text, status_rows
 from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import MissionStatus
-from ccatp.survey.events import WAITS_FOR, MissionState, waits_for
+from ccatp.survey.events import WAITS_FOR, Mode, waits_for
 from ccatp.survey.state import HoldState
 
 
@@ -37,7 +37,7 @@ def main_loop(folder: Path, runner: SimpleNamespace) -> Iterator[MainLoop]:
 
 @pytest.fixture
 def loop(tmp_path: Path) -> Iterator[MainLoop]:
-    with main_loop(tmp_path, standing(MissionState.IDLE, [])) as made:
+    with main_loop(tmp_path, standing(Mode.IDLE, [])) as made:
         yield made
 
 
@@ -79,7 +79,7 @@ def standing(mode: StrEnum, said: list[str]) -> SimpleNamespace:
     )
 
 
-@pytest.mark.parametrize("mode", [*MissionState, *BeaconMode])
+@pytest.mark.parametrize("mode", [*Mode, *BeaconMode])
 def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: StrEnum
 ) -> None:
@@ -97,9 +97,9 @@ def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
 
 
 def test_the_status_of_a_robot_that_stands_says_what_is_next() -> None:
-    assert next_text(MissionStatus(seq=0, t_s=0.0, state="idle")) == WAITS_FOR[MissionState.IDLE]
+    assert next_text(MissionStatus(seq=0, t_s=0.0, state="idle")) == WAITS_FOR[Mode.IDLE]
     for told in ({"cause": "operator"}, {"exit_status": 0}):
         assert next_text(MissionStatus(seq=0, t_s=0.0, state="idle", **told)) == ""
-    for moving in (MissionState.DRIVING, BeaconMode.FOLLOWING):
+    for moving in (Mode.DRIVING, BeaconMode.FOLLOWING):
         assert next_text(MissionStatus(seq=0, t_s=0.0, state=str(moving))) == ""
     assert next_text(MissionStatus(seq=-1, t_s=0.0, state="")) == ""

@@ -14,7 +14,7 @@ from ccatp.daemon.supervision.process import Endpoints, RunContext, open_log
 from ccatp.errors import ExitStatus
 from ccatp.links.liveness import RateLimitedLog, kind_of
 from ccatp.links.topics import DangerEvent, LogMessage, MissionStatus, TrackMessage
-from ccatp.survey.events import MissionState
+from ccatp.survey.events import Mode
 from tests.support.recorded import make_run, record_beacons
 from tests.support.scenario import world_of
 
@@ -113,13 +113,13 @@ def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.Captur
 @pytest.mark.parametrize(
     ("state", "cause", "text"),
     [
-        (MissionState.HELD, "operator", "held: operator"),
-        (MissionState.TURNING, "", "resumed: turning"),
-        (MissionState.RETURNING, "fire", "returning: fire"),
-        (MissionState.HELD, "", "held"),
+        (Mode.HELD, "operator", "held: operator"),
+        (Mode.TURNING, "", "resumed: turning"),
+        (Mode.RETURNING, "fire", "returning: fire"),
+        (Mode.HELD, "", "held"),
     ],
 )
-def test_a_mission_that_continues_reports_it(state: MissionState, cause: str, text: str) -> None:
+def test_a_mission_that_continues_reports_it(state: Mode, cause: str, text: str) -> None:
     assert state_text(state, cause) == text
 
 

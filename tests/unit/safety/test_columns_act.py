@@ -15,7 +15,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.safety import edge_episode, emergency_latch
 from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
-from ccatp.survey.events import MissionState
+from ccatp.survey.events import Mode
 from ccatp.survey.state import SurveyState
 from tests.support.mission_story import Story
 from tests.support.rows import DANGER, OTHERS
@@ -120,14 +120,14 @@ def test_retries_is_how_often_a_hold_may_repeat(row: Condition) -> None:
 def reacted(config: Config, mirror: Mirror, verdict: Verdict) -> SurveyState:
     """The state of a driving survey after a verdict."""
     story = Story(config, mirror)
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     story.frame(verdict)
     return story.state
 
 
 def what_ends(state: SurveyState) -> tuple[bool, bool]:
     """Whether an operator has to end the hold, and whether a fix comes before the next move."""
-    assert state.mode is MissionState.HELD
+    assert state.mode is Mode.HELD
     return state.is_held_by_hand, state.is_lost
 
 

@@ -8,7 +8,7 @@ from ccatp.safety.edge_monitors import SeamMonitor
 from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, EmergencyLatch
 from ccatp.safety.motion_sums import MotionSum
 from ccatp.safety.wheel_monitor import FrameSpan, WheelMonitor
-from ccatp.survey.events import MissionState
+from ccatp.survey.events import Mode
 from tests.support.scenario import mirror_of
 
 FRAME_S = 0.01
@@ -109,4 +109,4 @@ def test_an_emergency_is_latched_until_it_is_cleared(
 
 
 def test_the_states_are_those_of_the_mission() -> None:
-    assert {state.value for state in (MissionState.IDLE, MissionState.HELD, MissionState.DONE)} == AT_BASE_OR_HELD
+    assert {state.value for state in (Mode.IDLE, Mode.HELD, Mode.DONE)} == AT_BASE_OR_HELD

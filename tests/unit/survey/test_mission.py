@@ -20,7 +20,7 @@ from ccatp.survey.events import (
     FixStored,
     Interrupted,
     MissionEvent,
-    MissionState,
+    Mode,
     Pause,
     PointMissed,
     Resume,
@@ -46,16 +46,14 @@ def story(config: Config, mirror: Mirror) -> Story:
 
 
 def test_the_table_is_total_and_hold_is_one_event_away() -> None:
-    for state, event in product(MissionState, MissionEvent):
-        assert next_state(state, event) in MissionState
-    for state in set(MissionState) - {MissionState.DONE}:
-        assert next_state(state, MissionEvent.HOLD) is MissionState.HELD
-    for state in set(MissionState) - {MissionState.BACKING_OFF, MissionState.DONE}:
-        assert next_state(state, MissionEvent.EDGE) is MissionState.BACKING_OFF
-    assert {next_state(MissionState.DONE, event) for event in MissionEvent} == {MissionState.DONE}
-    assert (
-        next_state(MissionState.BACKING_OFF, MissionEvent.GO_HOME) is MissionState.BACKING_OFF
-    )  # an edge outranks an abort
+    for state, event in product(Mode, MissionEvent):
+        assert next_state(state, event) in Mode
+    for state in set(Mode) - {Mode.DONE}:
+        assert next_state(state, MissionEvent.HOLD) is Mode.HELD
+    for state in set(Mode) - {Mode.BACKING_OFF, Mode.DONE}:
+        assert next_state(state, MissionEvent.EDGE) is Mode.BACKING_OFF
+    assert {next_state(Mode.DONE, event) for event in MissionEvent} == {Mode.DONE}
+    assert next_state(Mode.BACKING_OFF, MissionEvent.GO_HOME) is Mode.BACKING_OFF  # an edge outranks an abort
 
 
 def test_a_fix_at_the_start_comes_before_the_first_leg_and_costs_no_route(config: Config, mirror: Mirror) -> None:
@@ -67,31 +65,31 @@ def test_a_fix_at_the_start_comes_before_the_first_leg_and_costs_no_route(config
     assert story.plans == []
 
 
-@pytest.mark.parametrize("state", [MissionState.DRIVING, MissionState.MEASURING])
-def test_pause_and_resume_from_every_state(story: Story, state: MissionState) -> None:
+@pytest.mark.parametrize("state", [Mode.DRIVING, Mode.MEASURING])
+def test_pause_and_resume_from_every_state(story: Story, state: Mode) -> None:
     story.until_state(state)
     assert story.mission.handle(Pause(Cause("operator"))) is None
     for _ in range(100):
         assert story.frame().twist == Twist(0.0, 0.0)
-    assert story.state.mode is MissionState.HELD
+    assert story.state.mode is Mode.HELD
     assert story.state.is_paused
     assert story.mission.handle(Resume()) is None
     story.finish()
 
 
 def test_resume_is_refused_where_nothing_is_held(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     assert story.mission.handle(Resume()) == "the mission is not held but driving"
 
 
-@pytest.mark.parametrize("state", [MissionState.TURNING, MissionState.MEASURING, MissionState.HELD])
-def test_abort_goes_home_from_every_state(story: Story, state: MissionState) -> None:
-    if state is MissionState.HELD:
-        story.until_state(MissionState.DRIVING)
+@pytest.mark.parametrize("state", [Mode.TURNING, Mode.MEASURING, Mode.HELD])
+def test_abort_goes_home_from_every_state(story: Story, state: Mode) -> None:
+    if state is Mode.HELD:
+        story.until_state(Mode.DRIVING)
         story.mission.handle(Pause(Cause("operator")))
     else:
         story.until_state(state)
-    story.until_state(MissionState.DONE, ABORT)
+    story.until_state(Mode.DONE, ABORT)
     assert story.state.outcome is SurveyOutcome.AT_BASE
     assert text_of(story.state.cause) == "emergency: fire"
     x, y = story.motion().deck.x_m, story.motion().deck.y_m
@@ -101,11 +99,11 @@ def test_abort_goes_home_from_every_state(story: Story, state: MissionState) -> 
 
 def test_a_robot_that_is_held_because_the_laser_does_not_follow_goes_home_by_odometry(story: Story) -> None:
     story.auto_fix = False
-    story.until_state(MissionState.MEASURING)
+    story.until_state(Mode.MEASURING)
     story.mission.handle(Fault(Cause("the laser does not follow the robot")))
     assert story.state.is_faulted
     story.mission.handle(Abort(Cause("operator")))
-    story.until_state(MissionState.DONE)
+    story.until_state(Mode.DONE)
     assert story.state.outcome is SurveyOutcome.AT_BASE
 
 
@@ -117,20 +115,20 @@ def test_edge_backs_off_at_most_60_mm_turns_away_fixes_and_resumes(story: Story,
         assert story.frame(FRONT_OFF).twist.v_m_s <= 0.0
     backed = len(story.orders)
     assert story.state.cause == RIM_AHEAD.because()
-    story.until(lambda: story.state.mode is not MissionState.BACKING_OFF)
+    story.until(lambda: story.state.mode is not Mode.BACKING_OFF)
     assert all(-config.mission.backoff_speed_m_s <= o.twist.v_m_s <= 0.0 for o in story.orders[backed:])
     assert hypot(story.x - start[0], story.y - start[1]) <= config.mission.backoff_m + 0.01
-    assert story.state.mode is MissionState.SETTLING
+    assert story.state.mode is Mode.SETTLING
     story.until(lambda: story.orders[-1].measure)
     assert story.state.done == ()  # that fix was none of a point
-    story.until(lambda: story.state.mode is MissionState.DRIVING)
+    story.until(lambda: story.state.mode is Mode.DRIVING)
     assert len(story.plans) == 1  # the route goes on from where the robot really is
     story.finish()
 
 
 def test_an_edge_that_does_not_clear_faults(story: Story) -> None:
     story.drive_on()
-    story.until_state(MissionState.HELD, FRONT_OFF)
+    story.until_state(Mode.HELD, FRONT_OFF)
     assert "stuck at the edge" in text_of(story.state.cause)
     assert not story.state.is_faulted  # it may have been a flash of light
     story.until(lambda: story.state.is_faulted, FRONT_OFF, frames=3100)
@@ -139,11 +137,11 @@ def test_an_edge_that_does_not_clear_faults(story: Story) -> None:
 
 def found_at_the_edge(story: Story) -> None:
     """After a retreat and a fix the sensor is off still."""
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     story.frame(FRONT_OFF)
     for _ in range(12):
         story.frame(FRONT_OFF)
-    story.until_state(MissionState.MEASURING)
+    story.until_state(Mode.MEASURING)
     story.until(lambda: not story.state.is_lost)
     story.orders.clear()
 
@@ -153,8 +151,8 @@ def test_found_at_an_edge_it_stands_until_the_danger_loop_knows_where(story: Sto
     for _ in range(19):
         story.frame(FRONT_OFF)
     assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders)
-    assert story.state.mode is not MissionState.BACKING_OFF
-    story.until_state(MissionState.DRIVING)
+    assert story.state.mode is not Mode.BACKING_OFF
+    story.until_state(Mode.DRIVING)
     story.finish()
 
 
@@ -162,18 +160,18 @@ def test_an_edge_that_the_danger_loop_still_sees_then_is_left_again(story: Story
     found_at_the_edge(story)
     for _ in range(22):
         story.frame(FRONT_OFF)
-    assert story.state.mode is MissionState.BACKING_OFF
+    assert story.state.mode is Mode.BACKING_OFF
 
 
 def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None:
     stays_off = replace(
         FRONT_OFF, cause=EDGE_SENSOR_STAYS_OFF.because(), signal="front_left", severity=Severity.HOLD, reverse=False
     )
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     measured = len(story.state.done)
     for _ in range(300):
         story.frame(stays_off)
-    assert story.state.mode is MissionState.HELD
+    assert story.state.mode is Mode.HELD
     assert story.state.cause == EDGE_SENSOR_STAYS_OFF.because()
     assert sum(order.measure for order in story.orders[-300:]) == 1
     assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders[-300:])
@@ -187,7 +185,7 @@ def test_a_cause_that_is_not_known_holds_the_robot_although_all_is_permitted(sto
     story.drive_on()
     unknown = replace(FREE, cause=Cause("mirror_on_fire"), severity=severity)
     assert story.frame(unknown).twist == Twist(0.0, 0.0)
-    assert (story.state.mode, text_of(story.state.cause)) == (MissionState.HELD, "mirror_on_fire")
+    assert (story.state.mode, text_of(story.state.cause)) == (Mode.HELD, "mirror_on_fire")
     story.finish()  # it is gone: a fix comes first
     assert story.state.outcome is SurveyOutcome.COMPLETE
 
@@ -209,7 +207,7 @@ def test_missing_data_during_a_back_off_only_pause_it(story: Story) -> None:
     story.frame(FRONT_OFF)
     for _ in range(20):
         assert story.frame(replace(FRONT_OFF, reverse=False)).twist == Twist(0.0, 0.0)
-    assert story.state.mode is MissionState.BACKING_OFF
+    assert story.state.mode is Mode.BACKING_OFF
     assert story.frame(FRONT_OFF).twist.v_m_s < 0.0
 
 
@@ -234,13 +232,13 @@ def test_a_robot_that_cannot_be_found_does_not_drive(story: Story) -> None:
 
 
 def test_a_robot_that_stands_to_be_found_needs_no_permission(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     story.mission.handle(Fault(Cause("filter: not finite"), loses_pose=True))
     story.mission.handle(Resume())
     denied = replace(FREE, forward=False, reverse=False, turn=False, cause=ESTIMATE_NOT_FINITE.because())
     story.until(lambda: story.orders[-1].measure, denied)
     story.frame(denied)
-    assert story.state.mode is MissionState.HELD  # found, and waits for the permission to move
+    assert story.state.mode is Mode.HELD  # found, and waits for the permission to move
     story.finish()
 
 
@@ -267,7 +265,7 @@ def test_a_turn_that_leaves_the_place_uncertain_ends_with_a_fix(config: Config, 
 @pytest.mark.parametrize("doubts_odometry", [True, False])
 def test_what_odometry_did_before_a_fault_that_loses_the_pose_is_doubted(story: Story, doubts_odometry: bool) -> None:
     """Once, as what the localizer gets from it is added; a filter that has diverged begins again by itself."""
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     event = (
         Fault(Cause("blocked"), loses_pose=True)
         if doubts_odometry
@@ -279,7 +277,7 @@ def test_what_odometry_did_before_a_fault_that_loses_the_pose_is_doubted(story: 
 
 
 def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
-    story.until_state(MissionState.SETTLING)
+    story.until_state(Mode.SETTLING)
     for _ in range(1100):
         story.v = 0.01
         story.frame()
@@ -304,7 +302,7 @@ def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story
     story.mission.handle(FixStored(point))
     assert story.state.done == (point,)
     asked = []
-    while story.state.mode is not MissionState.DONE:
+    while story.state.mode is not Mode.DONE:
         if story.frame().measure:
             asked.append(story.state.measuring_point)
             story.mission.handle(FixStored(story.state.measuring_point))
@@ -313,19 +311,19 @@ def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story
 
 
 def test_a_leg_that_does_not_end_faults(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     x, y = story.x, story.y
     for _ in range(3000):
         story.frame()
         story.x, story.y = x, y  # the wheels spin
-        if story.state.mode is MissionState.HELD:
+        if story.state.mode is Mode.HELD:
             break
     assert story.state.is_faulted
     assert "overdue" in text_of(story.state.cause)
 
 
 def test_stop_ends_where_the_robot_stands(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     story.mission.handle(StopHere())
     assert story.state.outcome is SurveyOutcome.STOPPED
     assert story.frame().twist == Twist(0.0, 0.0)
@@ -396,7 +394,7 @@ def test_a_miss_that_a_pause_overtakes_ends_in_a_new_route(story: Story) -> None
     miss(story, 0.03, 0.0)
     story.frame(None)
     story.auto_fix = True
-    story.until_state(MissionState.DONE)
+    story.until_state(Mode.DONE)
     assert len(story.plans) == 1
 
 
@@ -404,7 +402,7 @@ def test_after_a_correction_an_unsafe_turn_is_planned_anew(story: Story, monkeyp
     monkeypatch.setattr(LegFollower, "can_proceed", lambda *_: False)
     miss(story, 0.02, 0.0)
     story.auto_fix = True
-    story.until_state(MissionState.DONE)
+    story.until_state(Mode.DONE)
     assert len(story.plans) == 1  # of the leg after the correction; the one after that is as planned
     assert len(story.state.done) == 3
 
@@ -434,7 +432,7 @@ def test_what_is_switched_off_does_not_steer(config: Config, mirror: Mirror, key
         else replace(now, creep=(-0.1 * sin(heading), 0.1 * cos(heading)))
     )
     with_it, without = (Story(config, mirror), story)
-    with_it.until(lambda: with_it.mission.state.mode is MissionState.DRIVING and with_it.v > 0.09)
+    with_it.until(lambda: with_it.mission.state.mode is Mode.DRIVING and with_it.v > 0.09)
     assert abs(without.mission.step(used, FREE).twist.omega_rad_s) < 1e-3  # all but on its line: little to steer
     assert abs(with_it.mission.step(used, FREE).twist.omega_rad_s) > 0.1
 
@@ -447,7 +445,7 @@ def test_where_no_way_leads_on_or_home_a_fix_comes_before_the_fault(config: Conf
 
     planner = story.planner(home=refuse, rejoin=refuse)
     story.mission = Mission(Survey(config, mirror, story.route_of(story.stops), planner))
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     story.mission.handle(PointMissed())
     story.mission.handle(Pause(Cause("operator")))
     story.mission.handle(Resume())
@@ -455,7 +453,7 @@ def test_where_no_way_leads_on_or_home_a_fix_comes_before_the_fault(config: Conf
         if event is not None:
             story.mission.handle(event)
         story.frame()
-        assert story.state.mode is MissionState.SETTLING
+        assert story.state.mode is Mode.SETTLING
         begun = len(story.orders)
         story.until(lambda: story.state.is_faulted)
         assert [order.measure for order in story.orders[begun:]].count(True) == 1
@@ -472,7 +470,7 @@ def test_a_robot_whose_estimate_is_beyond_the_rim_continues_after_a_fix(config: 
         return story.plan_rest(route, start, skip)
 
     story.mission = Mission(Survey(config, mirror, story.route_of(story.stops), story.planner(rejoin=rejoin)))
-    story.until_state(MissionState.DRIVING)
+    story.until_state(Mode.DRIVING)
     story.mission.handle(Pause(Cause("operator")))
     story.mission.handle(Resume())
     story.finish()
@@ -526,11 +524,11 @@ def test_on_the_way_home_a_gap_has_to_leave_the_clearance_from_the_rim(
 ) -> None:
     story = Gap(config, mirror)
     story.drive_on()
-    story.until(lambda: story.state.mode is MissionState.RETURNING and story.v > 0.05, ABORT)
+    story.until(lambda: story.state.mode is Mode.RETURNING and story.v > 0.05, ABORT)
     story.open(sigma_m, 0.0)
     story.frame(ABORT)
-    assert (story.state.mode is MissionState.SETTLING) is stands
-    story.until_state(MissionState.DONE, ABORT)
+    assert (story.state.mode is Mode.SETTLING) is stands
+    story.until_state(Mode.DONE, ABORT)
     assert story.state.outcome is SurveyOutcome.AT_BASE
 
 
@@ -540,5 +538,5 @@ def test_eta_falls_as_stops_are_done(story: Story) -> None:
     assert story.state.eta_s == 1.0
     story.mission.handle(Abort(Cause("operator")))
     assert story.state.eta_s == 0.0
-    story.until_state(MissionState.DONE)
+    story.until_state(Mode.DONE)
     assert story.state.eta_s == 0.0

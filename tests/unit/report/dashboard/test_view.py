@@ -13,7 +13,7 @@ from ccatp.links.topics import DisplayState, Heartbeat
 from ccatp.report.dashboard.app import StateCollector
 from ccatp.report.dashboard.history import Growing, Lines, Trail, TruthCompare, is_gap
 from ccatp.report.dashboard.view import NO_LINE, Links, LinkState
-from ccatp.survey.events import MissionState
+from ccatp.survey.events import Mode
 
 
 def presence(process: str, t_s: float, *, pid: int = 1, phase: str = "joined", age_s: float | None = 0.01) -> Heartbeat:
@@ -203,7 +203,7 @@ def test_either_may_come_first_and_frames_between_are_not_compared() -> None:
 # -- what Prometheus reads ---------------------------------------------------------------------------------------------
 
 
-GROUND: dict[str, Any] = {"title": "fyst-m1", "states": [str(state) for state in MissionState]}
+GROUND: dict[str, Any] = {"title": "fyst-m1", "states": [str(state) for state in Mode]}
 NOTHING: dict[str, Any] = {
     "is_sim": False, "trouble": "main has sent no heartbeat", "links": [], "restarts": {"main": 0, "danger": 2},
     "pids": {},
