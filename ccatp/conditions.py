@@ -161,13 +161,13 @@ class Condition:
         """Severity in the list of alarms; for an edge or an emergency it follows from the action."""
         return self.severity or _ALARM_SEVERITY[self.action]
 
-    def because(self, **values: object) -> Cause:
+    def cause(self, **values: object) -> Cause:
         """The condition as a cause; ``values``: of the variable parts of the message."""
         return Cause(self.name, {name: _plain(value) for name, value in values.items()})
 
     def found(self, signal: str, value: float, limit: float, **values: str) -> "MonitorFinding":
         """The finding that the condition applies: ``value`` against ``limit``; ``values``: parts of the message."""
-        return MonitorFinding(self, self.severity, self.because(**values), signal, value, limit, self.full_fans)
+        return MonitorFinding(self, self.severity, self.cause(**values), signal, value, limit, self.full_fans)
 
 
 def _plain(value: object) -> int | float | str:

@@ -261,7 +261,7 @@ class DangerMonitor(SafetyRules):
         if self._edges.is_lifted:
             row = conditions.ALL_OFF
             permits = row.motion.permits()
-            return Verdict(seq, t_s, row.code, row.because(), "edge", 4.0, 3.0, *permits, off=EVERYWHERE)
+            return Verdict(seq, t_s, row.code, row.cause(), "edge", 4.0, 3.0, *permits, off=EVERYWHERE)
         declared = self._declared()
         if declared is not None or self._centre_clearance.direction:
             return self._edge_verdict(seq, t_s, declared, missing)
@@ -284,7 +284,7 @@ class DangerMonitor(SafetyRules):
             row, signal = conditions.CENTRE_NEAR_RIM, "estimate"
             value, limit = clearance.clearance_m, clearance.limit_m
         forward, reverse = barred <= 0 and not (off[0] or off[1]), barred >= 0 and not (off[2] or off[3])
-        cause, permits = row.because(), row.motion.permits(Permits(forward, reverse, turn))
+        cause, permits = row.cause(), row.motion.permits(Permits(forward, reverse, turn))
         if missing is not None:
             cause, permits = msgspec.structs.replace(cause, besides=missing.cause), NO_MOTION
         return Verdict(seq, t_s, row.code, cause, signal, value, limit, *permits, off=off)

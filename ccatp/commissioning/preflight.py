@@ -197,7 +197,7 @@ def _rate(kind: str, count: int, report: RobotReport) -> PreflightResult | None:
     if (count + 1) / span_s >= least_hz:
         return None
     varies = {"rate": f"{count / span_s:.0f}", "least": f"{least_hz:.0f}"}
-    return failed(text_of(SENSOR_TOO_SLOW.because(sensor=sensor, **varies)), SENSOR_TOO_SLOW.advice)
+    return failed(text_of(SENSOR_TOO_SLOW.cause(sensor=sensor, **varies)), SENSOR_TOO_SLOW.advice)
 
 
 def _encoders(report: RobotReport) -> PreflightResult:

@@ -153,5 +153,5 @@ class FanGate:
             else:
                 continue
             self.refused += 1
-            return FANS_REFUSED.because(why=why)
+            return FANS_REFUSED.cause(why=why)
         return None

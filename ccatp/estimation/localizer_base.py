@@ -290,7 +290,7 @@ class LocalizerBase(ABC):
             imu = believed
         imu, (right, left) = intake.imu(t_s, imu), intake.wheels(t_s, encoders)
         if intake.backward_source:
-            self._request_hold(SENSOR_BACKWARD.because(sensor=intake.backward_source))
+            self._request_hold(SENSOR_BACKWARD.cause(sensor=intake.backward_source))
             intake.backward_source = ""
         self.coasted = None
         try:
@@ -312,7 +312,7 @@ class LocalizerBase(ABC):
                 return True
             self.counts["suspect_frames"] += 1
         if self._stale_run >= BACKWARD_LIMIT:
-            self._request_hold(FRAMES_BACKWARD.because())
+            self._request_hold(FRAMES_BACKWARD.cause())
         return False
 
     def _check_speeds(self, v_m_s: float, omega_rad_s: float) -> None:
@@ -327,7 +327,7 @@ class LocalizerBase(ABC):
     def _freeze(self, error: FilterDiverged) -> None:
         self.is_frozen = True
         self.counts["diverged"] += 1
-        self._request_hold(FILTER_DIVERGED.because(why=error))
+        self._request_hold(FILTER_DIVERGED.cause(why=error))
 
     def _request_hold(self, cause: Cause) -> None:
         self.hold_cause = self.hold_cause or cause

@@ -37,7 +37,7 @@ class Emergency:
 
 def cause_of(kind: EmergencyKind) -> Cause:
     """The condition of a kind of emergency; in an earthquake the robot must not move."""
-    return EARTHQUAKE.because() if kind is EmergencyKind.EARTHQUAKE else EMERGENCY.because(kind=kind.value)
+    return EARTHQUAKE.cause() if kind is EmergencyKind.EARTHQUAKE else EMERGENCY.cause(kind=kind.value)
 
 
 class EmergencyLatch:

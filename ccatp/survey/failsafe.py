@@ -67,7 +67,7 @@ def _stand_in_earthquake(rules: HoldRules[S], s: S, _frame: object, v: Verdict) 
     """No motion in an earthquake. Afterwards the robot relocalizes, because it may have slipped, and drives home."""
     s = replace(s, emergency_epoch=v.raised)
     if not s.interlock and s.mode is not DONE:
-        why = EARTHQUAKE.because()
+        why = EARTHQUAKE.cause()
         s = rules.lose_pose(replace(s, interlock=True, abort_cause=s.abort_cause or why))
         s = rules.hold(s, why, by_hand=s.is_held_by_hand)
     # A fault is left to its own row, because it also needs an operator.
@@ -181,7 +181,7 @@ def _retreat(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict
         return s, True
     mission, backoffs = survey.cfg.mission, s.backoffs + 1
     if backoffs > mission.max_backoffs_per_stop:
-        return survey.fault(replace(s, backoffs=0), BACK_OFFS.because(count=mission.max_backoffs_per_stop)), True
+        return survey.fault(replace(s, backoffs=0), BACK_OFFS.cause(count=mission.max_backoffs_per_stop)), True
     s = replace(
         s,
         backoffs=backoffs,

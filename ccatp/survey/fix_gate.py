@@ -163,9 +163,7 @@ class FixGate:
         if why is not None and (is_first or why):
             where = "its base" if is_first else "the place it drove to"
             distance_m = dist(fix.position_m, expected_m)
-            return FixFinding(
-                refusal=FRAME_REFUSED.because(distance_m=distance_m, place=where, why=why or _UNEXPLAINED)
-            )
+            return FixFinding(refusal=FRAME_REFUSED.cause(distance_m=distance_m, place=where, why=why or _UNEXPLAINED))
         return FixFinding(doubt=self._doubt(fix, pose, covariance))
 
     def _doubt(self, fix: Fix, pose: DeckPose, covariance: FloatArray) -> str:
@@ -198,7 +196,7 @@ class FixGate:
         if not self._is_first:
             return NO_CAUSE
         why = explain_lengths(self._cfg, expected_m, lengths_m, self._collimators_m)
-        return LENGTHS_REFUSED.because(why=why) if why else NO_CAUSE
+        return LENGTHS_REFUSED.cause(why=why) if why else NO_CAUSE
 
 
 # Guard band (ISO 14253-1): the tolerance is reduced by the uncertainty of the fix. It is limited, so that an imprecise

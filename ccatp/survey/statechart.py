@@ -261,7 +261,7 @@ class Survey(HoldRules[SurveyState]):
         return is_long and (follower.is_at_rim(leg.stop) or follower.distance_m(leg.stop, motion.pose) > reach_m)
 
     def _overdue(self, s: SurveyState, stop: Stop) -> SurveyState:
-        return self.fault(s, conditions.LEG_OVERDUE.because(x_m=stop.x_m, y_m=stop.y_m))
+        return self.fault(s, conditions.LEG_OVERDUE.cause(x_m=stop.x_m, y_m=stop.y_m))
 
     def _arrive(self, s: SurveyState, motion: StateEstimate) -> Step:
         return self._settle(self.apply(replace(s, behaviour=None), MissionEvent.ARRIVED), motion)
@@ -305,7 +305,7 @@ class Survey(HoldRules[SurveyState]):
             planner, over = self.planner, {*s.done, *s.skipped}
             route = planner.route(deck, due) if due else planner.rejoin(s.route, deck, over)
         except PlanError as error:
-            return self._without_way(s, conditions.NO_WAY_ON.because(why=error))
+            return self._without_way(s, conditions.NO_WAY_ON.cause(why=error))
         return replace(s, route=route, stop_index=0, behaviour=None, is_off_route=False, is_confirmed=False)
 
     def _review_time(self, s: SurveyState, motion: StateEstimate) -> tuple[SurveyState, bool]:
@@ -319,7 +319,7 @@ class Survey(HoldRules[SurveyState]):
         going_on = budget.review(progress, motion.t_s, motion.deck, left)
         s = replace(s, budget=progress)
         if going_on is None:
-            cause = s.abort_cause or conditions.TIME_USED_UP.because(budget_s=budget.budget_s)
+            cause = s.abort_cause or conditions.TIME_USED_UP.cause(budget_s=budget.budget_s)
             return self.proceed(replace(s, abort_cause=cause)), False
         if going_on is left:
             return s, True
@@ -349,7 +349,7 @@ class Survey(HoldRules[SurveyState]):
 
     def _check_rest(self, s: SurveyState, settling: Settling, motion: StateEstimate) -> SurveyState:
         if settling.is_overdue(motion.t_s):
-            return self.fault(s, conditions.NO_REST.because(v_m_s=motion.speed_m_s, omega_rad_s=motion.rate_rad_s))
+            return self.fault(s, conditions.NO_REST.cause(v_m_s=motion.speed_m_s, omega_rad_s=motion.rate_rad_s))
         return replace(s, behaviour=settling)
 
     # -- edge and home ------------------------------------------------------------------------------------------------
@@ -363,7 +363,7 @@ class Survey(HoldRules[SurveyState]):
         if retreat.step is RetreatStep.OVER or (retreat.step is RetreatStep.TURN_AWAY and s.abort_cause):
             return self.apply(replace(s, behaviour=None), MissionEvent.FIND), HOLD_POSITION
         if retreat.step is RetreatStep.STUCK:
-            s = self.hold(s, conditions.STUCK_AT_EDGE.because(), by_hand=False)
+            s = self.hold(s, conditions.STUCK_AT_EDGE.cause(), by_hand=False)
             return replace(s, stuck_s=motion.t_s), HOLD_POSITION
         return replace(s, behaviour=retreat), MissionCommand(twist)
 
@@ -375,7 +375,7 @@ class Survey(HoldRules[SurveyState]):
             try:
                 stops = self.planner.home(motion.deck)
             except PlanError as error:
-                return self._without_way(s, conditions.NO_WAY_HOME.because(why=error)), HOLD_POSITION
+                return self._without_way(s, conditions.NO_WAY_HOME.cause(why=error)), HOLD_POSITION
             return replace(s, behaviour=ReturnHome(stops), is_confirmed=False), HOLD_POSITION
         if home.is_at_base:
             s = self.apply(replace(s, outcome=SurveyOutcome.AT_BASE), MissionEvent.FINISHED)
@@ -472,13 +472,13 @@ class Survey(HoldRules[SurveyState]):
         s = replace(s, failures=0 if failures >= limit else failures)
         if point is None:
             if failures >= limit:
-                return self.fault(s, conditions.NOT_FOUND.because(why=cause))
+                return self.fault(s, conditions.NOT_FOUND.cause(why=cause))
             if isinstance(s.behaviour, Settling):  # this fix is needed; the robot may not have stood quite still
                 s = replace(s, behaviour=replace(s.behaviour, is_requested=False, is_repeated=True))
             return s
         s = replace(s, failure_causes={**s.failure_causes, point: cause}, due=_without(s.due, point))
         if failures >= limit:
-            s = self.fault(s, conditions.MEASUREMENTS_FAILED.because(count=limit, why=cause))
+            s = self.fault(s, conditions.MEASUREMENTS_FAILED.cause(count=limit, why=cause))
         return self._leave_stop(s, point, sigma_rad, is_measured=False)
 
     def _leave_pointless(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:

@@ -183,10 +183,10 @@ def test_an_earthquake_at_an_edge_presses_the_robot_on_and_resume_is_refused(sto
 def test_what_breaks_in_an_earthquake_waits_for_an_operator_when_it_is_over(story: Story) -> None:
     story.until_state(DRIVING)
     shaking = emergency(1, "earthquake")
-    frames(story, shaking, replace(shaking, severity=Severity.FAULT, cause=GRIP_TOO_LITTLE.because(), signal="grip"))
+    frames(story, shaking, replace(shaking, severity=Severity.FAULT, cause=GRIP_TOO_LITTLE.cause(), signal="grip"))
     assert story.state.is_faulted
     assert frames(story, FREE, count=50) is HELD
-    assert story.state.cause == GRIP_TOO_LITTLE.because()
+    assert story.state.cause == GRIP_TOO_LITTLE.cause()
     assert story.mission.handle(Resume()) is None
     story.until_state(DONE)
     assert story.state.done == ()

@@ -210,27 +210,27 @@ def test_invariants_in_very_many_orders_of_events(measured: Callable[[str, float
 # -- the pure step of a survey -----------------------------------------------------------------------------------------
 
 DENIED = replace(FREE, forward=False, reverse=False, turn=False)
-SHAKEN = replace(DENIED, code=EventCode.ABORTED, cause=EARTHQUAKE.because(), raised=1, is_shaking=True)
-HOLD = replace(DENIED, severity=Severity.HOLD, cause=WHEELS_STAND.because(), signal="encoders")
-STAYS_OFF = replace(HOLD, cause=EDGE_SENSOR_STAYS_OFF.because(), signal="front_left", code=EventCode.NEAR_EDGE)
+SHAKEN = replace(DENIED, code=EventCode.ABORTED, cause=EARTHQUAKE.cause(), raised=1, is_shaking=True)
+HOLD = replace(DENIED, severity=Severity.HOLD, cause=WHEELS_STAND.cause(), signal="encoders")
+STAYS_OFF = replace(HOLD, cause=EDGE_SENSOR_STAYS_OFF.cause(), signal="front_left", code=EventCode.NEAR_EDGE)
 VERDICTS: dict[str, Verdict | None] = {
     "free": FREE,
     "none": None,
-    "stale": replace(DENIED, severity=Severity.PAUSE, cause=EDGE_STALE.because()),
+    "stale": replace(DENIED, severity=Severity.PAUSE, cause=EDGE_STALE.cause()),
     "edge": FRONT_OFF,
     "edge, data missing": replace(FRONT_OFF, reverse=False),
-    "slow": replace(FREE, severity=Severity.SLOW, cause=SAMPLES_TOO_FEW.because()),
+    "slow": replace(FREE, severity=Severity.SLOW, cause=SAMPLES_TOO_FEW.cause()),
     "hold": HOLD,
     "sensor stays off": STAYS_OFF,
-    "low battery": replace(FREE, severity=Severity.RETURN, cause=BATTERY_LOW.because()),
-    "low battery at the edge": replace(FRONT_OFF, severity=Severity.RETURN, cause=BATTERY_LOW.because()),
-    "fault": replace(DENIED, severity=Severity.FAULT, cause=GRIP_TOO_LITTLE.because()),
+    "low battery": replace(FREE, severity=Severity.RETURN, cause=BATTERY_LOW.cause()),
+    "low battery at the edge": replace(FRONT_OFF, severity=Severity.RETURN, cause=BATTERY_LOW.cause()),
+    "fault": replace(DENIED, severity=Severity.FAULT, cause=GRIP_TOO_LITTLE.cause()),
     "fire": ABORT,
     "earthquake": SHAKEN,
     "earthquake at the edge": replace(FRONT_OFF, raised=1, is_shaking=True),
-    "earthquake and fault": replace(SHAKEN, severity=Severity.FAULT, cause=GRIP_TOO_LITTLE.because()),
+    "earthquake and fault": replace(SHAKEN, severity=Severity.FAULT, cause=GRIP_TOO_LITTLE.cause()),
     "of a newer version": replace(FREE, cause=Cause("mirror_on_fire")),
-    "earthquake and low battery": replace(SHAKEN, severity=Severity.RETURN, cause=BATTERY_LOW.because()),
+    "earthquake and low battery": replace(SHAKEN, severity=Severity.RETURN, cause=BATTERY_LOW.cause()),
 }
 STILL = Twist(0.0, 0.0)
 
@@ -247,10 +247,10 @@ def events(s: SurveyState, t_s: float, rng: random.Random) -> list[SurveyInput]:
         found.append(
             rng.choice(
                 (
-                    *(Pause(OPERATOR.because()), Resume(), Resume(), Abort(OPERATOR.because())),
-                    *(Interrupted(NO_FRAME_FOR.because(age_s=1.0)), Fault(FRAMES_LOST.because())),
-                    Fault(FANS_REFUSED.because(why="y"), loses_pose=True),
-                    *(EstimateDiverged(FILTER_DIVERGED.because(why="z"), t_s), TrackingGap()),
+                    *(Pause(OPERATOR.cause()), Resume(), Resume(), Abort(OPERATOR.cause())),
+                    *(Interrupted(NO_FRAME_FOR.cause(age_s=1.0)), Fault(FRAMES_LOST.cause())),
+                    Fault(FANS_REFUSED.cause(why="y"), loses_pose=True),
+                    *(EstimateDiverged(FILTER_DIVERGED.cause(why="z"), t_s), TrackingGap()),
                 )
             )
         )

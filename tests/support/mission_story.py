@@ -22,9 +22,9 @@ DT, LAG = 0.01, 0.08
 PANEL = PanelId(5, 5)
 FREE = Verdict.normal(0, 0.0)
 FRONT_OFF = replace(
-    FREE, code=EventCode.NEAR_EDGE, cause=RIM_AHEAD.because(), forward=False, turn=False, off=(True, True, False, False)
+    FREE, code=EventCode.NEAR_EDGE, cause=RIM_AHEAD.cause(), forward=False, turn=False, off=(True, True, False, False)
 )
-ABORT = replace(FREE, code=EventCode.ABORTED, cause=EMERGENCY.because(kind="fire"), raised=1)
+ABORT = replace(FREE, code=EventCode.ABORTED, cause=EMERGENCY.cause(kind="fire"), raised=1)
 
 
 class Story:

@@ -21,10 +21,10 @@ def test_an_advice_refers_to_no_other_row(row: Condition) -> None:
 
 
 def test_the_text_of_a_cause_has_its_numbers_duration_repetition_and_what_is_found_besides() -> None:
-    cause = FAN_WEAK.because(side="left")
+    cause = FAN_WEAK.cause(side="left")
     assert text_of(cause) == "the left fan gets weak"
     assert text_of(replace(cause, lasted_s=30.0)) == "the left fan gets weak, for 30 s"
-    assert text_of(replace(cause, repetition=2, besides=NO_ESTIMATE.because())) == (
+    assert text_of(replace(cause, repetition=2, besides=NO_ESTIMATE.cause())) == (
         "the left fan gets weak, on repetition 2; no estimate"
     )
     assert text_of(NO_CAUSE) == ""
@@ -37,6 +37,6 @@ def test_a_cause_of_another_version_is_shown_with_its_name_and_its_values() -> N
 
 
 def test_values_travel_as_numbers_or_text() -> None:
-    cause = MEASUREMENTS_FAILED.because(count=3, why=ValueError("no fix"), share=inf)
+    cause = MEASUREMENTS_FAILED.cause(count=3, why=ValueError("no fix"), share=inf)
     assert cause.values == {"count": 3, "why": "no fix", "share": "inf"}
     assert decode(encode(cause), type=Cause) == cause

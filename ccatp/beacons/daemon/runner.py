@@ -116,7 +116,7 @@ class BeaconRunner(MissionRunner):
     def on_tracking_gap(self) -> None:
         """A fault: the robot's place is not known, and the map depends on it."""
         self._reader.forget()
-        self.mission.handle(Fault(FRAMES_MISSED.because()))
+        self.mission.handle(Fault(FRAMES_MISSED.cause()))
 
     def publish_state(self) -> None:
         state, before, was_faulted = self.mission.state, self._state, self._was_faulted

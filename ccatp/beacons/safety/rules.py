@@ -247,7 +247,7 @@ class BeaconSafetyRules(SafetyRules):
         else:
             return emergency or Verdict.normal(seq, t_s)
         permits = row.motion.permits(Permits(forward, reverse, turn=True))
-        return Verdict(seq, t_s, row.code, row.because(), *found, *permits)
+        return Verdict(seq, t_s, row.code, row.cause(), *found, *permits)
 
     def _nearest_target_m(self) -> float:
         """Lower bound of the target's distance: mean level minus one standard deviation; infinite without a level."""

@@ -63,7 +63,7 @@ def _why_held(
 ) -> Cause:
     left = [point for point in points if point not in measured and point not in skipped]
     goes_on = f"continues with point {left[0].row}-{left[0].col}-{left[0].point}" if left else "ends it"
-    return RESTARTED.because(before=before, done=len(measured), left=len(left), goes_on=goes_on)
+    return RESTARTED.cause(before=before, done=len(measured), left=len(left), goes_on=goes_on)
 
 
 def _open_store(cfg: Config, args: ProcessArgs, mirror: str, points: Sequence[PointId]) -> MissionStore:

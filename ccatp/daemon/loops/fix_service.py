@@ -160,7 +160,7 @@ class FixService:
         clock, reported_s = asyncio.get_running_loop().time, -inf
         try:
             while self._is_wanted(request) and not await self._client.is_laser_ready():
-                self.wait_cause = LASER_NOT_READY.because()
+                self.wait_cause = LASER_NOT_READY.cause()
                 if clock() - reported_s >= LASER_REPORT_S:
                     reported_s = clock()
                     self._notify("warning", f"measurement of {_name(request.point)} waits: {LASER_NOT_READY.message}")
@@ -201,7 +201,7 @@ class FixService:
         if finding.refusal:
             raise LaserUnusable(finding.refusal)
         if stuck and self._follow.is_certain:
-            raise LaserUnusable(LASER_NOT_FOLLOWING.because(count=self._follow.standstills))
+            raise LaserUnusable(LASER_NOT_FOLLOWING.cause(count=self._follow.standstills))
         if doubt:
             self._notify("info", f"the fix at {_name(request.point)} is not used: {doubt}")
             return doubt
@@ -230,7 +230,7 @@ class FixService:
             try:
                 await self._await_commit(self._store.record_skipped(request.point, request.t_s), request.point)
             except StoreError as error:
-                self._mission.handle(Fault(SKIP_NOT_STORED.because(point=_name(request.point), why=error)))
+                self._mission.handle(Fault(SKIP_NOT_STORED.cause(point=_name(request.point), why=error)))
                 return
         self._mission.handle(FixFailed(request.point, cause, self._heading_sigma_of()))
 
@@ -247,7 +247,7 @@ class FixService:
             except AlreadyMeasuredError as error:
                 self._notify("warning", str(error))  # the point is stored already
             except StoreError as error:
-                mission.handle(Fault(FIX_NOT_STORED.because(point=_name(request.point), why=error)))
+                mission.handle(Fault(FIX_NOT_STORED.cause(point=_name(request.point), why=error)))
                 return
             self._note_metrology(fix)
         self._mission.handle(FixStored(request.point, self._heading_sigma_of()))
@@ -258,7 +258,7 @@ class FixService:
         self.metrology_cause = NO_CAUSE
         if self._unreliable >= self._alarm_points:
             who = " ".join(map(str, fix.suspects))
-            self.metrology_cause = METROLOGY_UNRELIABLE.because(count=self._unreliable, channels=who)
+            self.metrology_cause = METROLOGY_UNRELIABLE.cause(count=self._unreliable, channels=who)
         if self._unreliable == self._alarm_points:
             self._notify("warning", text_of(self.metrology_cause))
 
@@ -271,7 +271,7 @@ class FixService:
                 self._notify("warning", f"the disk is slow: {_name(point)} waits for its commit")
                 await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
             if not waiting.done():
-                self._mission.handle(Fault(DISK_STALLS.because(point=_name(point), time_s=STALLED_DISK_S)))
+                self._mission.handle(Fault(DISK_STALLS.cause(point=_name(point), time_s=STALLED_DISK_S)))
                 self._host.release_time()
             await waiting
         finally:

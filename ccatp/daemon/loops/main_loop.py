@@ -36,9 +36,9 @@ SAMPLED_LEVELS = 10
 UNSEEN_S = 0.1
 
 COMMANDS: dict[OperatorCommand, Pause | Resume | Abort | StopHere] = {
-    OperatorCommand.PAUSE: Pause(OPERATOR.because()),
+    OperatorCommand.PAUSE: Pause(OPERATOR.cause()),
     OperatorCommand.RESUME: Resume(),
-    OperatorCommand.ABORT: Abort(OPERATOR.because()),
+    OperatorCommand.ABORT: Abort(OPERATOR.cause()),
     OperatorCommand.STOP: StopHere(),
 }
 
@@ -139,7 +139,7 @@ class MainLoop:
         self._was_at_rest = self._runner.is_at_rest
         self.heartbeat.phase = "rejoining"
         self._time.withheld = None
-        cause = LINK_LOST.because(reason=reason)
+        cause = LINK_LOST.cause(reason=reason)
         self._runner.mission.handle(Interrupted(cause))
         self._telemetry.notify_operator("warning", f"{text_of(cause)}; reconnecting")
 

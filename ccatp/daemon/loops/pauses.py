@@ -20,7 +20,7 @@ class PauseWatch:
 
     def interrupt(self, row: Condition, **values: float) -> bool:
         """Hold the mission until frames are fresh; returns whether this changed its state or its cause."""
-        mission, cause = self._runner.mission, row.because(**values)
+        mission, cause = self._runner.mission, row.cause(**values)
         before = mission.state
         mission.handle(Interrupted(cause))
         if _own_pause_of(before) not in (None, row):

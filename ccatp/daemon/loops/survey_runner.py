@@ -250,7 +250,7 @@ class SurveyRunner(MissionRunner):
                 "error", f"held for {held_s:.0f} s, waiting for an operator: {text_of(mission.state.cause)}"
             )
         elif action is FaultAction.RETURN:
-            mission.handle(Abort(UNATTENDED_FAULT.because(charge=sensors.soc)))
+            mission.handle(Abort(UNATTENDED_FAULT.cause(charge=sensors.soc)))
 
     def execute(self, command: MissionCommand, motion: StateEstimate) -> None:
         mission, seq = self.mission, self._clock.seq

@@ -31,11 +31,11 @@ from tests.support.http_server import Posts, taking_posts
 from tests.support.runs import until
 from tests.support.scenario import config_of
 
-FAN = conditions.FAN_WEAK.because(side="left")
-RIM = conditions.RIM_AHEAD.because()
-STALE = conditions.EDGE_STALE.because()
+FAN = conditions.FAN_WEAK.cause(side="left")
+RIM = conditions.RIM_AHEAD.cause()
+STALE = conditions.EDGE_STALE.cause()
 FIRE, QUAKE, WEATHER = map(cause_of, (EmergencyKind.FIRE, EmergencyKind.EARTHQUAKE, EmergencyKind.WEATHER))
-SLOW = conditions.SENSOR_TOO_SLOW.because(sensor="edge sensors", rate="100", least="200")
+SLOW = conditions.SENSOR_TOO_SLOW.cause(sensor="edge sensors", rate="100", least="200")
 NONE = Severity.NONE
 
 
@@ -62,7 +62,7 @@ def shown(known: AlarmList) -> list[tuple[str, str]]:
     ("causes", "listed"),
     [
         ([], []),
-        ([(conditions.OPERATOR.because(), NONE)], []),
+        ([(conditions.OPERATOR.cause(), NONE)], []),
         ([(SLOW, Severity.SLOW)], []),
         ([(FAN, NONE)], [("fan_weak", "return")]),
         ([(STALE, Severity.PAUSE)], []),

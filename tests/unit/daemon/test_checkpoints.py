@@ -113,7 +113,7 @@ def test_a_store_is_not_overwritten_and_a_resumed_plan_leaves_out_what_is_measur
 # -- taken over --------------------------------------------------------------------------------------------------------
 
 QUAKE = structs.replace(
-    FREE, code=EventCode.ABORTED, cause=EARTHQUAKE.because(), forward=False, reverse=False, turn=False, raised=1,
+    FREE, code=EventCode.ABORTED, cause=EARTHQUAKE.cause(), forward=False, reverse=False, turn=False, raised=1,
     is_shaking=True,
 )  # fmt: skip
 FIX = Fix(1.0, (0.0, 0.0, 0.0), tuple(np.eye(3).ravel().tolist()), 1.0, (1, 2, 3, 4), 0.0)

@@ -63,10 +63,10 @@ def test_action_gives_the_severity(row: Condition) -> None:
 
 @named([*DANGER, *OTHERS])
 def test_action_gives_the_colour_of_the_alarm(row: Condition, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = active_cause(row.because()).severity
+    before = active_cause(row.cause()).severity
     other = replace(row, action=Action.SLOW if before is not Severity.SLOW else Action.FAULT)
     monkeypatch.setitem(TABLE, row.name, other)
-    assert active_cause(row.because()).severity is not before
+    assert active_cause(row.cause()).severity is not before
 
 
 @named(FOUND)

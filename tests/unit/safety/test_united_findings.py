@@ -29,7 +29,7 @@ CODES = {
 
 
 def found(row: Condition) -> MonitorFinding:
-    return MonitorFinding(row, row.severity, row.because(), row.name, 2.0, 1.0, row.full_fans)
+    return MonitorFinding(row, row.severity, row.cause(), row.name, 2.0, 1.0, row.full_fans)
 
 
 def denied(verdict: Verdict) -> tuple[bool, bool, bool]:

@@ -65,7 +65,7 @@ def test_a_sensor_whose_samples_have_impossible_times_is_silent(kind: str, row: 
     permits = [[(v.forward, v.reverse, v.turn) for v in one] for one in (verdicts, silent)]
     assert permits[0] == permits[1]
     assert permits[0].index((False, False, False)) in (14, 15)  # the newest sample is then 0.15 s old
-    assert verdicts[-1].cause == row.because()
+    assert verdicts[-1].cause == row.cause()
     assert all(verdict.raised for verdict in verdicts)
     assert verdicts[0].severity is Severity.INFORM
 

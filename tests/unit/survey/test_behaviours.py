@@ -235,7 +235,7 @@ def verdict_of(off: Four, *, may_turn: bool, row: Condition = RIM_AHEAD) -> Verd
     code = EventCode.NEAR_EDGE if any(off) else EventCode.NORMAL
     is_free = not any(off)
     forward, reverse = not (off[0] or off[1]), not (off[2] or off[3])
-    return Verdict(0, 0.0, code, row.because(), "", 0.0, 0.0, forward, reverse, may_turn or is_free, off)
+    return Verdict(0, 0.0, code, row.cause(), "", 0.0, 0.0, forward, reverse, may_turn or is_free, off)
 
 
 def deck_of(pose: PanelPose) -> DeckPose:

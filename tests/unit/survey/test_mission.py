@@ -114,7 +114,7 @@ def test_edge_backs_off_at_most_60_mm_turns_away_fixes_and_resumes(story: Story,
     for _ in range(60):
         assert story.frame(FRONT_OFF).twist.v_m_s <= 0.0
     backed = len(story.orders)
-    assert story.state.cause == RIM_AHEAD.because()
+    assert story.state.cause == RIM_AHEAD.cause()
     story.until(lambda: story.state.mode is not Mode.BACKING_OFF)
     assert all(-config.mission.backoff_speed_m_s <= o.twist.v_m_s <= 0.0 for o in story.orders[backed:])
     assert hypot(story.x - start[0], story.y - start[1]) <= config.mission.backoff_m + 0.01
@@ -165,14 +165,14 @@ def test_an_edge_that_the_danger_loop_still_sees_then_is_left_again(story: Story
 
 def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None:
     stays_off = replace(
-        FRONT_OFF, cause=EDGE_SENSOR_STAYS_OFF.because(), signal="front_left", severity=Severity.HOLD, reverse=False
+        FRONT_OFF, cause=EDGE_SENSOR_STAYS_OFF.cause(), signal="front_left", severity=Severity.HOLD, reverse=False
     )
     story.until_state(Mode.DRIVING)
     measured = len(story.state.done)
     for _ in range(300):
         story.frame(stays_off)
     assert story.state.mode is Mode.HELD
-    assert story.state.cause == EDGE_SENSOR_STAYS_OFF.because()
+    assert story.state.cause == EDGE_SENSOR_STAYS_OFF.cause()
     assert sum(order.measure for order in story.orders[-300:]) == 1
     assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders[-300:])
     assert len(story.state.done) == measured  # the fix is nobody's point
@@ -235,7 +235,7 @@ def test_a_robot_that_stands_to_be_found_needs_no_permission(story: Story) -> No
     story.until_state(Mode.DRIVING)
     story.mission.handle(Fault(Cause("filter: not finite"), loses_pose=True))
     story.mission.handle(Resume())
-    denied = replace(FREE, forward=False, reverse=False, turn=False, cause=ESTIMATE_NOT_FINITE.because())
+    denied = replace(FREE, forward=False, reverse=False, turn=False, cause=ESTIMATE_NOT_FINITE.cause())
     story.until(lambda: story.orders[-1].measure, denied)
     story.frame(denied)
     assert story.state.mode is Mode.HELD  # found, and waits for the permission to move
