@@ -1,6 +1,5 @@
 """A mission among beacons: set points from readings and the verdict of the danger loop. Time is an argument."""
 
-from enum import StrEnum
 from math import isfinite
 from typing import NamedTuple
 
@@ -8,14 +7,15 @@ from msgspec.structs import replace
 
 from ccatp.beacons.conditions import MISSION_TOO_LONG
 from ccatp.beacons.config.models import RadioConfig
-from ccatp.beacons.modes import FOLLOWING, MAPPING, VISITING
+from ccatp.beacons.modes import FOLLOWING, MAPPING, VISITING, BeaconMode, Deciding, Returning, Working
 from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.conditions import Action
-from ccatp.core import Verdict
+from ccatp.core import NO_CAUSE, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
+from ccatp.survey.engagement import Engagement, EngagementRules, Event, Row, enter
 from ccatp.survey.events import (
     DONE,
     HELD,
@@ -34,13 +34,12 @@ from ccatp.survey.failsafe import (
     is_denied,
     stand,
 )
-from ccatp.survey.state import Hold, HoldRules, HoldState, Row
 
 # States of such a mission. In idle, held and done the danger loop expects the robot to stand.
 MODES = IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE
 
 
-class BeaconRules(HoldRules[HoldState]):
+class BeaconRules(EngagementRules[Engagement]):
     """A mission among beacons proceeds as soon as any motion is permitted."""
 
     rows = (
@@ -49,9 +48,11 @@ class BeaconRules(HoldRules[HoldState]):
         ON_EMERGENCY,
     )
 
-    def proceed(self, s: HoldState) -> HoldState:
-        """Back to idle; the next frame selects the mode."""
-        return replace(s, mode=IDLE, cause=s.abort_cause, hold=Hold())
+    def proceed(self, s: Engagement) -> Engagement:
+        """To its start after an abort, else to the task that the next frame shows."""
+        if s.abort_cause:
+            return enter(replace(s, cause=s.abort_cause), Event.GO_HOME, Returning())
+        return enter(replace(s, cause=NO_CAUSE), Event.GO_ON, Deciding())
 
 
 RULES = BeaconRules()
@@ -98,7 +99,7 @@ class BeaconMission:
         self._begun_s: float | None = None
         self._followed_s = 0.0
         self._is_following = cfg.follow.is_active
-        self.state = HoldState()
+        self.state = Engagement()
 
     def handle(self, event: SurveyInput) -> str | None:
         """Handle an event between two frames. Returns the reason of a refusal, or ``None``."""
@@ -106,11 +107,11 @@ class BeaconMission:
         return refusal
 
     def _finish(self, outcome: SurveyOutcome) -> None:
-        self.state = replace(self.state, mode=DONE, outcome=outcome)
+        self.state = RULES.finish(self.state, outcome)
 
-    def _enter(self, mode: StrEnum) -> None:
-        if self.state.mode is not mode:
-            self.state = replace(self.state, mode=mode)
+    def _work(self, task: BeaconMode) -> None:
+        if self.state.mode is not task:
+            self.state = enter(self.state, Event.GO_ON, Working(task))
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
@@ -155,7 +156,7 @@ class BeaconMission:
             if self.state.abort_cause:
                 self._finish(SurveyOutcome.AT_BASE)  # it never left
             else:
-                self._enter(MAPPING)
+                self._work(MAPPING)
             return HALT
         t_s, avoidance = measurements.t_s, self._cfg.avoidance
         # A frame without readings counts as free space; the pilot remembers earlier obstacles.
@@ -167,14 +168,14 @@ class BeaconMission:
         if not self._is_following:
             self._visit()
         else:
-            self._enter(FOLLOWING)
+            self._work(FOLLOWING)
             self._followed_s += interval_s
             if self._followed_s >= self._cfg.mission.follow_s:
                 self._finish(SurveyOutcome.COMPLETE)
         return HALT if self.state.outcome is not SurveyOutcome.NONE else drive
 
     def _visit(self) -> None:
-        self._enter(VISITING)
+        self._work(VISITING)
         waypoints = self._cfg.workspace.waypoints_m
         while len(self.arrivals) < min(self.pilot.waypoints.reached, self.total):
             lap, waypoint = divmod(len(self.arrivals), len(waypoints))
@@ -183,7 +184,6 @@ class BeaconMission:
             self._finish(SurveyOutcome.COMPLETE)
 
     def _return(self, t_s: float, interval_s: float, distances_m: list[float]) -> SteeringCommand:
-        self._enter(RETURNING)
         if self._homing is None:
             self._homing = BeaconPilot(self._cfg, (self._cfg.start.x_m, self._cfg.start.y_m))
         drive = self._homing.drive(t_s, interval_s, self.navigator.belief.pose, None, distances_m)

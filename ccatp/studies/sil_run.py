@@ -317,7 +317,7 @@ class SilRun:
     def record_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
         """Nothing is recorded."""
 
-    def after_requests(self, sensors: Sensors) -> None:
+    def after_requests(self, sensors: Sensors, command: MissionCommand) -> None:
         """Nothing is reported."""
 
     def report_grip(self) -> None:

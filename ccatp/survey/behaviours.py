@@ -11,6 +11,8 @@ from ccatp.config.models import ControlConfig, MissionConfig
 from ccatp.control.tracker import LegMotion, LegPhase, LegTracker
 from ccatp.core import EventCode, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.kinematics import difference
+from ccatp.survey.engagement import Kind, Phase
+from ccatp.survey.events import BACKING_OFF, MEASURING, SETTLING
 from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
 
 # Tolerance for the rounding of sums of frame periods, which must not cost a frame.
@@ -28,6 +30,7 @@ class MissionCommand(msgspec.Struct, frozen=True):
     arrived: PointId | None = None  # the point, if it came to rest there for the first time (not after a correction)
     measure: bool = False  # request a measurement: of a point, or to relocalize
     inflates_covariance: bool = False
+    skips_calibration: bool = False  # the calibration drive is given up, because the robot is too far from it
 
 
 HOLD_POSITION = MissionCommand(STILL)
@@ -62,45 +65,55 @@ class Standstill(msgspec.Struct, frozen=True):
         return Standstill(t_s - since_s >= cfg.settle_time_s - TIME_EPSILON_S, since_s, mean_m_s, mean_rad_s)
 
 
-class Settling(msgspec.Struct, frozen=True, tag=True):
-    """From the end of a leg to the request for a measurement, after standing for the measuring time."""
+class Settling(Phase, frozen=True, tag=True):
+    """At the end of a leg, until the robot is at rest. ``rest_by_s``: deadline for that, from the first frame on."""
 
     standstill: Standstill = Standstill()
-    rest_by_s: float | None = None  # deadline for coming to rest, and then for standing still
+    rest_by_s: float | None = None
+
+    kind, shown = Kind.WORK, SETTLING
+
+    def update(self, cfg: ControlConfig, motion: StateEstimate) -> "Settling":
+        """One frame. The phase ends with ``standstill.is_rest``."""
+        rest_by_s = motion.t_s + SETTLE_LIMIT_S if self.rest_by_s is None else self.rest_by_s
+        return Settling(self.standstill.update(cfg, motion), rest_by_s)
+
+
+class Measuring(Phase, frozen=True, tag=True):
+    """From rest to the end of a measurement, which is requested after standing for the measuring time."""
+
+    standstill: Standstill = Standstill()
+    rest_by_s: float | None = None  # deadline for standing still
     measure_at_s: float = 0.0  # end of the measuring time
     is_requested: bool = False  # a measurement is requested and still wanted
     is_repeated: bool = False  # the measurement failed: request it again after another measuring time
 
-    def settle(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "Settling":
-        """One frame of coming to rest. It ends with ``standstill.is_rest``; then the measuring time begins."""
-        standstill = self.standstill.update(cfg, motion)
-        rest_by_s = motion.t_s + SETTLE_LIMIT_S if self.rest_by_s is None else self.rest_by_s
-        settling = replace(self, standstill=standstill, rest_by_s=rest_by_s)
-        return settling._timed(motion.t_s, measuring_time_s) if standstill.is_rest else settling
+    kind, shown = Kind.WORK, MEASURING
 
-    def measure(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "tuple[Settling, bool]":
+    @classmethod
+    def begin(cls, settled: Settling, t_s: float, measuring_time_s: float) -> "Measuring":
+        """At rest: the measuring time begins."""
+        return cls(settled.standstill)._timed(t_s, measuring_time_s)
+
+    def update(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "tuple[Measuring, bool]":
         """One frame of the measuring time, which any motion restarts; and whether to request the measurement now."""
         t_s = motion.t_s
-        settling = replace(self, standstill=self.standstill.update(cfg, motion))
-        if settling.is_repeated:
-            settling = replace(settling, is_repeated=False)._timed(t_s, measuring_time_s)
-        if not settling.standstill.is_rest:
-            if settling.is_requested:
-                settling = replace(settling, is_requested=False)._timed(t_s, measuring_time_s)
-            settling = replace(settling, measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S)
-        if settling.is_requested or t_s < settling.measure_at_s:
-            return settling, False
-        return replace(settling, rest_by_s=None, is_requested=True), True
+        measuring = replace(self, standstill=self.standstill.update(cfg, motion))
+        if measuring.is_repeated:
+            measuring = replace(measuring, is_repeated=False)._timed(t_s, measuring_time_s)
+        if not measuring.standstill.is_rest:
+            if measuring.is_requested:
+                measuring = replace(measuring, is_requested=False)._timed(t_s, measuring_time_s)
+            measuring = replace(measuring, measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S)
+        if measuring.is_requested or t_s < measuring.measure_at_s:
+            return measuring, False
+        return replace(measuring, rest_by_s=None, is_requested=True), True
 
-    def _timed(self, t_s: float, measuring_time_s: float) -> "Settling":
+    def _timed(self, t_s: float, measuring_time_s: float) -> "Measuring":
         return replace(self, measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S, rest_by_s=t_s + SETTLE_LIMIT_S)
 
-    def is_overdue(self, t_s: float) -> bool:
-        """Whether the deadline for coming to rest, or for standing still, has passed."""
-        return self.rest_by_s is not None and t_s > self.rest_by_s
 
-
-class ReturnHome(msgspec.Struct, frozen=True, tag=True):
+class ReturnHome(msgspec.Struct, frozen=True):
     """The way home along ``stops``, of which the last is base; ``stop_index`` is past the last at the end."""
 
     stops: tuple[Stop, ...]
@@ -160,7 +173,7 @@ class RetreatStep(StrEnum):
     STUCK = "stuck"
 
 
-class Retreat(msgspec.Struct, frozen=True, tag=True):
+class Retreat(Phase, frozen=True, tag=True):
     """Backs off along the track just driven, then turns away from the side that hung over the edge.
 
     A robot that reached the edge in reverse does not turn, because it faces away from the edge.
@@ -178,6 +191,8 @@ class Retreat(msgspec.Struct, frozen=True, tag=True):
     has_turned_away: bool = False
     turn: LegMotion | None = None  # the turn away, once it has begun
     goal_rad: float = 0.0  # heading at the end of the turn away
+
+    kind, shown = Kind.RETREAT, BACKING_OFF
 
     @classmethod
     def begin(cls, cfg: MissionConfig, verdict: Verdict, pose: PanelPose, rate_rad_s: float) -> "Retreat":

@@ -25,12 +25,16 @@ def home_time_s(mirror: Mirror, limits: LimitsConfig, x_m: float, y_m: float) ->
 
 
 class BudgetProgress(NamedTuple):
-    """Start (robot time), planned times of the work done and of the next point, time in earlier processes, s."""
+    """Start (robot time), planned times of the work done and of the next point, time in earlier processes, s.
+
+    ``is_review_due``: a point was left since the last review.
+    """
 
     begun_s: float | None = None
     planned_s: float = 0.0
     next_s: float = 0.0
     before_s: float = 0.0
+    is_review_due: bool = False
 
 
 class TimeBudget:

@@ -43,7 +43,7 @@ _BEGUN_S = 0.1
 _NO_ROUTE = Route((), (0.0,))
 
 
-class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=3, forbid_unknown_fields=True):
+class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=4, forbid_unknown_fields=True):
     """What a main loop saves for the next one: the state of the survey and the pose of the robot.
 
     Route and measured points are left out: the next loop plans the route again and reads the points from the mission's

@@ -1,15 +1,12 @@
-"""Modes of a mission, events, the table of transitions, and the inputs that arrive between two frames."""
+"""Modes of a mission, its outcomes, and the inputs that arrive between two frames."""
 
-from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from ccatp.control.gate import Purpose
 from ccatp.core import Cause, PointId
 from ccatp.missions import SEARCHED
-
-M = TypeVar("M", bound=StrEnum)
 
 
 class Mode(StrEnum):
@@ -41,21 +38,6 @@ WAITS_FOR = MappingProxyType(
 )
 
 
-class MissionEvent(StrEnum):
-    """Events of a mission. An event that the table does not list for a mode has no effect."""
-
-    GO_ON = "go on"  # the survey starts, or continues with the next leg
-    TURNED = "turned"  # the robot points at the stop
-    REALIGN = "realign"  # the robot no longer points at the stop
-    ARRIVED = "arrived"  # the stop is reached
-    SETTLED = "settled"  # the robot is at rest there
-    EDGE = "edge"  # code 1: near the mirror's edge
-    GO_HOME = "go home"  # code 2, or the operator's abort
-    FIND = "find"  # stand still for a fix, because the pose is not trusted
-    HOLD = "hold"  # pause, fault, or no permission to move
-    FINISHED = "finished"  # all points done, at base after an abort, or stopped
-
-
 class SurveyOutcome(StrEnum):
     """Outcome of a mission."""
 
@@ -65,27 +47,6 @@ class SurveyOutcome(StrEnum):
     STOPPED = "stopped"
 
 
-_ANYWHERE = {MissionEvent.HOLD: HELD, MissionEvent.FINISHED: DONE}
-_SURVEYING = _ANYWHERE | {
-    MissionEvent.EDGE: BACKING_OFF,
-    MissionEvent.GO_HOME: RETURNING,
-    MissionEvent.GO_ON: TURNING,
-}
-_STOPPING = {MissionEvent.ARRIVED: SETTLING, MissionEvent.FIND: SETTLING}
-# (state, event) -> state. An edge precedes an abort: while backing off, GO_HOME has no effect. DONE is final.
-TRANSITIONS: Mapping[StrEnum, Mapping[MissionEvent, Mode]] = MappingProxyType(
-    {
-        IDLE: _SURVEYING | {MissionEvent.FIND: SETTLING},
-        TURNING: _SURVEYING | _STOPPING | {MissionEvent.TURNED: DRIVING},
-        DRIVING: _SURVEYING | _STOPPING | {MissionEvent.REALIGN: TURNING},
-        SETTLING: _SURVEYING | {MissionEvent.SETTLED: MEASURING},
-        MEASURING: _SURVEYING,
-        BACKING_OFF: _ANYWHERE | {MissionEvent.FIND: SETTLING},
-        RETURNING: _ANYWHERE | {MissionEvent.EDGE: BACKING_OFF, MissionEvent.FIND: SETTLING},
-        HELD: _SURVEYING | {MissionEvent.FIND: SETTLING},
-        DONE: {},
-    }
-)
 # The purpose for which the drive gate permits motion in a mode of a survey.
 PURPOSES = MappingProxyType(
     {
@@ -100,11 +61,6 @@ PURPOSES = MappingProxyType(
         DONE: Purpose.STAND,
     }
 )
-
-
-def next_state(state: M, event: MissionEvent) -> M | Mode:
-    """The state after ``event``; total over all pairs."""
-    return TRANSITIONS.get(state, _ANYWHERE).get(event, state)
 
 
 def waits_for(state: str) -> str:

@@ -10,22 +10,24 @@ from msgspec.structs import replace
 from ccatp.conditions import BACK_OFFS, EARTHQUAKE, STUCK_AT_EDGE, Action, Clear, Condition, find_condition
 from ccatp.core import Severity, Verdict
 from ccatp.safety.escalation import limit_s
-from ccatp.survey.behaviours import Retreat, ReturnHome
-from ccatp.survey.events import BACKING_OFF, DONE, DRIVING, HELD, TURNING, MissionEvent
-from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import (
+from ccatp.survey.behaviours import Retreat
+from ccatp.survey.engagement import (
     ABORTED,
     FAULT,
     HOLD,
     NEAR_EDGE,
     NO_FRESH_VERDICT,
     RETURN,
-    FixNeed,
-    HoldRules,
+    EngagementRules,
+    Event,
+    Held,
+    Kind,
     Row,
     S,
-    SurveyState,
+    enter,
 )
+from ccatp.survey.route_follower import StateEstimate
+from ccatp.survey.state import Lost, Returning, SurveyState, Travel
 
 if TYPE_CHECKING:
     from ccatp.survey.statechart import Survey
@@ -63,34 +65,28 @@ def clear_of(v: Verdict) -> Clear:
 # -- rows of every mission --------------------------------------------------------------------------------------------
 
 
-def _stand_in_earthquake(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
-    """No motion in an earthquake. Afterwards the robot relocalizes, because it may have slipped, and drives home."""
-    s = replace(s, emergency_epoch=v.raised)
-    if not s.interlock and s.mode is not DONE:
-        why = EARTHQUAKE.cause()
-        s = rules.lose_pose(replace(s, interlock=True, abort_cause=s.abort_cause or why))
-        s = rules.hold(s, why, by_hand=s.is_held_by_hand)
-    # A fault is left to its own row, because it also needs an operator.
-    return s, v.severity is not FAULT
+def _stand_in_earthquake(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
+    """No motion in an earthquake. A fault is left to its own row, because it also needs an operator."""
+    return rules.shake(replace(s, emergency_epoch=v.raised), EARTHQUAKE.cause()), v.severity is not FAULT
 
 
-def stand(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
+def stand(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
     """No motion until what the row states: an operator, or the cause is gone, for a hold with a fix after it."""
     clear = clear_of(v)
     if clear is Clear.OPERATOR:
-        return s if s.mode is HELD and s.is_faulted else rules.fault(s, v.cause, loses_pose=True), True
+        return s if s.is_faulted else rules.fault(s, v.cause, loses_pose=True), True
     if not is_denied(v) or (clear is Clear.AUTO and v.severity < HOLD):
         return pause(rules, s, _frame, v)
     return _hold(rules, s, _frame, v, relocalizes=clear is Clear.AFTER_FIX)
 
 
-def _hold(rules: HoldRules[S], s: S, _frame: object, v: Verdict, *, relocalizes: bool = True) -> tuple[S, bool]:
+def _hold(rules: EngagementRules[S], s: S, _frame: object, v: Verdict, *, relocalizes: bool = True) -> tuple[S, bool]:
     row = row_of(v)
     rejects_odometry = row is None or not row.trusts_wheels
     return rules.await_recovery(s, v.cause, rejects_odometry=rejects_odometry, relocalizes=relocalizes), True
 
 
-def pause(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
+def pause(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
     """Hold until the cause is gone."""
     # A robot that stands for a fix needs no permit, and may not get one before the fix.
     if s.stands_for_fix and v is not NO_FRESH_VERDICT:
@@ -98,7 +94,7 @@ def pause(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, boo
     return rules.interrupt(s, v.cause), True
 
 
-def _go_home(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
+def _go_home(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
     """Abort once for each emergency, which every verdict repeats."""
     return rules.abort(replace(s, emergency_epoch=v.raised), v.cause), False
 
@@ -138,21 +134,20 @@ Reaction = tuple[SurveyState, bool]  # the state, and whether that is all for th
 
 def _locate(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict) -> Reaction:
     """Take one fix at rest: if the pose is wrong, a sensor that stays off may be over a seam or the rim."""
-    if s.mode is DONE or s.is_held_by_hand:
+    if s.kind is Kind.OVER or s.is_held_by_hand:
         return s, False
-    if not s.has_looked:
-        s = survey.await_recovery(replace(s, has_looked=True), v.cause)
-        s = survey.proceed(s)
+    if not s.located:
+        s = survey.proceed(survey.await_recovery(replace(s, located=v.cause), v.cause))
     return s, s.stands_for_fix
 
 
 def _slow(_survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict) -> Reaction:
     """Reduce the speed now, or return to the usual speed with the next leg."""
     s = replace(s, is_slow=v.severity in REDUCED)
-    if s.is_slow and s.mode in (DRIVING, TURNING) and s.fix is FixNeed.NONE:
-        s = replace(s, behaviour=None)
-    elif s.is_slow and isinstance(s.behaviour, ReturnHome):
-        s = replace(s, behaviour=s.behaviour.interrupted())
+    if s.is_slow and isinstance(s.phase, Travel) and not s.needs_fix:
+        s = replace(s, phase=Travel())
+    elif s.is_slow and isinstance(s.phase, Returning) and s.phase.way is not None:
+        s = replace(s, phase=Returning(s.phase.way.interrupted()))
     return s, False
 
 
@@ -161,18 +156,24 @@ def _return(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict
     return survey.abort(replace(s, finding=v.cause), v.cause), False
 
 
+def _is_stuck(s: SurveyState) -> bool:
+    return isinstance(s.phase, Held) and s.phase.stuck_s is not None
+
+
 def _wait_at_edge(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict) -> Reaction:
-    """Wait after a retreat that did not leave the edge; a fault after ``hold_limit_s``."""
-    is_over = s.mode is not HELD or s.hold.by_hand or (v.code is not NEAR_EDGE and v is not NO_FRESH_VERDICT)
-    if s.stuck_s is None or is_over:
-        return replace(s, stuck_s=None), False
-    if motion.t_s - s.stuck_s > limit_s(STUCK_AT_EDGE, survey.cfg.health):
-        return survey.fault(replace(s, stuck_s=None), s.cause), True
+    """Wait after a retreat that did not leave the edge; a fault after the limit of the row."""
+    held = s.phase
+    if not isinstance(held, Held) or held.stuck_s is None:
+        return s, False
+    if v.code is not NEAR_EDGE and v is not NO_FRESH_VERDICT:
+        return replace(s, phase=replace(held, stuck_s=None)), False
+    if motion.t_s - held.stuck_s > limit_s(STUCK_AT_EDGE, survey.cfg.health):
+        return survey.fault(s, s.cause), True
     return s, True
 
 
 def _retreat(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict) -> Reaction:
-    if s.mode in (BACKING_OFF, DONE):
+    if s.kind in (Kind.RETREAT, Kind.OVER):
         return s, True
     if s.rejects_odometry:
         s = survey.proceed(s)  # stand for a fix, which is always safe: without it the place of the edge is unknown
@@ -188,12 +189,10 @@ def _retreat(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict
         # At an edge again after a fix of the position: the heading must be wrong.
         inflates_covariance=s.inflates_covariance or backoffs > 1,
         cause=v.cause,
-        is_missed=False,
         # The route avoids edges, so the pose is wrong: relocalize before moving on.
-        fix=FixNeed.RELOCALIZE,
-        behaviour=Retreat.begin(mission, v, motion.pose, motion.rate_rad_s),
+        pose=s.pose if isinstance(s.pose, Lost) else Lost(),
     )
-    return survey.apply(s, MissionEvent.EDGE), True
+    return enter(s, Event.EDGE, Retreat.begin(mission, v, motion.pose, motion.rate_rad_s)), True
 
 
 ROWS = (
@@ -219,7 +218,7 @@ ROWS = (
         lambda s, v: v.severity is RETURN and v.code is not NEAR_EDGE and v.cause != s.finding,
         _return,
     ),
-    Row("a retreat led nowhere", Action.WAIT, lambda s, _: s.stuck_s is not None, _wait_at_edge),
+    Row("a retreat led nowhere", Action.WAIT, lambda s, _: _is_stuck(s), _wait_at_edge),
     Row("an edge is declared (code 1)", Action.RETREAT, lambda _, v: v.code is NEAR_EDGE, _retreat),
     ON_NO_VERDICT,
     Row(

@@ -27,7 +27,6 @@ from ccatp.errors import ExitStatus
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.survey.events import Pause, Resume
-from ccatp.survey.state import FixNeed
 from tests.faults.linking import Measured
 from tests.support.daemon import Daemon, configuration, running_daemon, tell
 from tests.support.scenario import SurveyLoop, begin
@@ -243,7 +242,7 @@ async def test_frames_that_are_old_for_good_are_reported_as_that_and_are_a_fault
         assert not mission.state.is_faulted
         await daemon.until(lambda: mission.state.is_faulted)
         assert text_of(mission.state.cause).endswith("(limit 150 ms), for 3 s")
-        assert mission.state.fix is FixNeed.RELOCALIZE
+        assert mission.state.is_lost
         assert {(entry["level"], entry["text"]) for entry in daemon.events("operator_message")} >= {
             ("error", text_of(mission.state.cause))
         }

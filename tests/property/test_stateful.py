@@ -33,6 +33,7 @@ from ccatp.config.models import Config
 from ccatp.core import Cause, EmergencyKind, EventCode, Severity, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
+from ccatp.survey.engagement import NO_FRESH_VERDICT, Held
 from ccatp.survey.events import (
     BACKING_OFF,
     DONE,
@@ -56,7 +57,7 @@ from ccatp.survey.events import (
     TrackingGap,
 )
 from ccatp.survey.failsafe import ROWS
-from ccatp.survey.state import NO_FRESH_VERDICT, FixNeed, SurveyState
+from ccatp.survey.state import SurveyState
 from ccatp.survey.statechart import Survey
 from tests.property.stage import Stage
 from tests.support.mission_story import ABORT, FREE, FRONT_OFF, Story
@@ -262,7 +263,7 @@ def check(before: SurveyState, verdict: Verdict | None, s: SurveyState, command:
     stands = command.twist == STILL
     for row in ROWS:
         if row.applies(before, verdict or NO_FRESH_VERDICT):
-            is_passed = row.action is Action.WAIT and s.stuck_s is None
+            is_passed = row.action is Action.WAIT and not (isinstance(s.phase, Held) and s.phase.stuck_s is not None)
             is_free = row.action in (Action.SLOW, Action.RETURN, Action.RETREAT)
             assert is_free or stands or is_passed, row.when
             assert row.action is not Action.RETREAT or stands or s.mode is BACKING_OFF
@@ -290,7 +291,7 @@ def killed(survey: Survey, old: SurveyState, s: SurveyState, rng: random.Random)
     event = TakenOver(s.done, s.skipped, 1.0, is_new_run=rng.random() < 0.3)
     after, refusal = survey.handle(old, event)
     assert refusal is None
-    assert after.fix is FixNeed.RELOCALIZE  # before it moves
+    assert after.is_lost  # before it moves
     assert after.is_held_by_hand is old.is_held_by_hand
     assert after.done == s.done
     assert not {*after.due, *after.failure_causes} & set(s.done)

@@ -18,8 +18,8 @@ from ccatp.links import topics
 from ccatp.links.bus import Telemetry
 from ccatp.missions import MissionKind, Part
 from ccatp.survey import failsafe
+from ccatp.survey.engagement import Engagement, EngagementRules, Event, Kind, Phase, enter
 from ccatp.survey.events import DONE, DRIVING, SurveyInput, SurveyOutcome
-from ccatp.survey.state import Hold, HoldRules, HoldState
 
 SPEED_M_S, TURN_RAD_S, SIDES = 0.05, 0.5, 4
 
@@ -51,18 +51,22 @@ def stand_in(cfg: SquareConfig, options: StandInOptions) -> StandIn:
     return survey_stand_in(load_config(None, {"run.seed": cfg.run.seed, "run.world": "thesis"}), options)
 
 
-class Rules(HoldRules[HoldState]):
+class Driving(Phase, frozen=True, tag=True):
+    kind, shown = Kind.WORK, DRIVING
+
+
+class Rules(EngagementRules[Engagement]):
     rows = (*(failsafe.ON_EARTHQUAKE, failsafe.ON_FAULT, failsafe.ON_UNKNOWN, failsafe.ON_HOLD),
             *(failsafe.ON_NO_VERDICT, failsafe.ON_EMERGENCY))  # fmt: skip
 
-    def proceed(self, s: HoldState) -> HoldState:
+    def proceed(self, s: Engagement) -> Engagement:
         if s.abort_cause:  # it has no way home
-            return replace(s, mode=DONE, outcome=SurveyOutcome.STOPPED)
-        return replace(s, mode=DRIVING, cause=NO_CAUSE, hold=Hold())
+            return self.finish(s, SurveyOutcome.STOPPED)
+        return enter(replace(s, cause=NO_CAUSE), Event.GO_ON, Driving())
 
 
 class Mission:
-    state = HoldState()
+    state = Engagement()
 
     def handle(self, event: SurveyInput) -> str | None:
         self.state, refusal = Rules().handle(self.state, event)
@@ -109,7 +113,7 @@ class Runner(mission_runner.MissionRunner):
         if self._lasts_s * (v + omega) >= until:
             self._lasts_s, self._is_turning, self._sides = 0.0, not self._is_turning, self._sides + self._is_turning
         if self._sides == SIDES:
-            mission.state = replace(mission.state, mode=DONE, outcome=SurveyOutcome.COMPLETE)
+            mission.state = Rules().finish(mission.state, SurveyOutcome.COMPLETE)
             return self.hold(frame)
         self._pose = x + v * cos(heading) * frame.dt_s, y + v * sin(heading) * frame.dt_s, heading + omega * frame.dt_s
         rates = (v + side * 0.5 * omega * robot.wheel_base_m for side in (1.0, -1.0))

@@ -21,8 +21,8 @@ from ccatp.errors import ExitStatus
 from ccatp.links.bus import Publisher, Telemetry
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import DisplayState, MissionStatus
+from ccatp.survey.engagement import Engagement
 from ccatp.survey.events import SurveyInput, SurveyOutcome
-from ccatp.survey.state import HoldState
 
 EXIT_STATUS = {
     SurveyOutcome.COMPLETE: ExitStatus.COMPLETE,
@@ -101,7 +101,7 @@ class RunningMission(Protocol):
     """What the main loop needs of a mission."""
 
     @property
-    def state(self) -> HoldState:
+    def state(self) -> Engagement:
         """The present state."""
 
     @state.setter

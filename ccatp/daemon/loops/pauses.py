@@ -5,8 +5,8 @@ from msgspec.structs import replace
 from ccatp.conditions import Condition, Owner, find_condition, text_of
 from ccatp.daemon.loops.mission_runner import LoopLimits, MissionRunner
 from ccatp.safety.escalation import Since
+from ccatp.survey.engagement import Engagement
 from ccatp.survey.events import HELD, Fault, Interrupted
-from ccatp.survey.state import HoldState
 
 
 class PauseWatch:
@@ -47,7 +47,7 @@ class PauseWatch:
             self._runner.telemetry.notify_operator("error", text_of(cause))
 
 
-def _own_pause_of(state: HoldState) -> Condition | None:
+def _own_pause_of(state: Engagement) -> Condition | None:
     """The row of a hold whose cause only the main loop finds."""
     row = find_condition(state.cause.condition) if state.mode is HELD else None
     return row if row is not None and row.owner is Owner.MAIN else None

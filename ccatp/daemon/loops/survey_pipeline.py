@@ -11,7 +11,7 @@ from ccatp.links.topics import EstimateMessage, TreatmentKind
 from ccatp.sensing.wheel_means import as_standing
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.composition import SurveyParts
-from ccatp.survey.events import HELD, EstimateDiverged, Mode
+from ccatp.survey.events import EstimateDiverged, Mode
 from ccatp.survey.route_follower import StateEstimate
 
 
@@ -27,8 +27,8 @@ class SurveySink(Protocol):
     def execute(self, command: MissionCommand, motion: StateEstimate) -> None:
         """Handle a command with ``at_rest`` or ``measure``."""
 
-    def after_requests(self, sensors: Sensors) -> None:
-        """The mission gave requests in this frame, or is faulted, or waits for a calibration."""
+    def after_requests(self, sensors: Sensors, command: MissionCommand) -> None:
+        """The mission gave requests in this frame, or is faulted, or gives up the calibration drive."""
 
     def report_grip(self) -> None:
         """The grip was measured for the first time, in the turns of the calibration drive."""
@@ -63,7 +63,7 @@ class SurveyPipeline:
             begun, sigmas = start
             self._sink.record_treatment(sensors, "begun", (begun.x_m, begun.y_m, begun.heading_rad, *sigmas))
         state = mission.state
-        is_odometry_off = state.mode is HELD and state.rejects_odometry
+        is_odometry_off = state.rejects_odometry
         if is_odometry_off is not self._is_odometry_off:
             self._is_odometry_off = is_odometry_off
             self._sink.record_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")
@@ -102,7 +102,7 @@ class SurveyPipeline:
             raise RuntimeError("plan comes after estimate, and not for a stale frame")
         mission.state, command = mission.survey.step(mission.state, motion, verdict)
         state = mission.state
-        if command.inflates_covariance or state.wants_calibration or state.full_fans or state.hold.is_fault:
+        if command.inflates_covariance or command.skips_calibration or state.full_fans or state.is_faulted:
             self._apply_requests(sensors, command)
             state = mission.state
         # The gate compares with the verdict's time, which is the robot's own and may have jumped.
@@ -135,7 +135,7 @@ class SurveyPipeline:
             self._sink.record_treatment(sensors, "doubted", doubt)
         if self.mission.state.full_fans and self.thrust.give_all():  # thrust first, then the drive
             self._sink.begin_drives()
-        self._sink.after_requests(sensors)
+        self._sink.after_requests(sensors, command)
 
     def estimate_message(self, frame: TimedFrame) -> EstimateMessage:
         """The estimate for the danger loop."""

@@ -80,7 +80,6 @@ class SurveyRunner(MissionRunner):
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._state = Mode.IDLE
-        self._has_reported_calibration = False
 
     @property
     def is_busy(self) -> bool:
@@ -230,10 +229,9 @@ class SurveyRunner(MissionRunner):
             return False
         return self._mirror_check is None or self._host.is_lockstep
 
-    def after_requests(self, sensors: Sensors) -> None:
+    def after_requests(self, sensors: Sensors, command: MissionCommand) -> None:
         state = self.mission.state
-        if state.wants_calibration and not self._has_reported_calibration:
-            self._has_reported_calibration = True
+        if command.skips_calibration:
             self.telemetry.notify_operator("warning", GIVEN_UP)
         if state.is_faulted:
             self._check_unattended_fault(sensors)

@@ -14,7 +14,7 @@ from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.estimation.motion import Steering
 from ccatp.beacons.links.messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.beacons.mission import RULES, BeaconMission, WaypointArrival, check_beacon_robot, permitted, wheel_rates
-from ccatp.beacons.modes import VISITING
+from ccatp.beacons.modes import VISITING, Working
 from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, PoseBelief, SelfMap, packets_of
 from ccatp.beacons.records.store import BeaconStore, BeaconStoreError
 from ccatp.beacons.records.summary import BeaconSummary
@@ -29,8 +29,8 @@ from ccatp.errors import ConfigError
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
+from ccatp.survey.engagement import Engagement, Event, enter
 from ccatp.survey.events import DONE, HELD, Abort, Fault, Pause, Resume, StopHere
-from ccatp.survey.state import HoldState
 from tests.support.scenario import radio_config_of
 
 FREE = Verdict.normal(0, 0.0)
@@ -89,17 +89,17 @@ def test_stop_ends_it_where_it_is_and_then_it_takes_no_commands(stage: BeaconSil
 def test_what_holds_the_robot_says_when_it_continues() -> None:
     frame = BeaconMeasurements(0.0, (), BeaconFrame())
 
-    def after(state: HoldState, verdict: Verdict | None, *, goes_on: bool) -> HoldState:
+    def after(state: Engagement, verdict: Verdict | None, *, goes_on: bool) -> Engagement:
         state = RULES.react(state, frame, verdict)
         assert (state.mode is not HELD) is goes_on
         return state
 
-    state = HoldState(VISITING)
+    state = Engagement(Working(VISITING))
     assert RULES.handle(state, Resume())[1] == "the mission is not held but visiting"
     state = after(state, DENIED, goes_on=False)
     assert RULES.handle(state, Resume())[1] == "the cause persists: no beacon is received"
     state = after(state, FREE, goes_on=True)
-    state = after(replace(state, mode=VISITING), None, goes_on=False)
+    state = after(enter(state, Event.GO_ON, Working(VISITING)), None, goes_on=False)
     assert text_of(state.cause) == "no fresh verdict from the danger loop"
     state, _ = RULES.handle(after(state, FREE, goes_on=True), Fault(Cause("lost")))
     assert state.is_faulted

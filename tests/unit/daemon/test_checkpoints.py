@@ -16,7 +16,7 @@ from msgspec import structs
 from ccatp.conditions import EARTHQUAKE, text_of
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.core import Cause, DeckPose, EventCode, Fix, PointId, Severity, Verdict
+from ccatp.core import Cause, DeckPose, EventCode, Fix, PointId, Verdict
 from ccatp.daemon.loops.checkpoint_writer import CheckpointWriter
 from ccatp.daemon.loops.checkpoints import StoreUnusable, build_parts
 from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
@@ -27,9 +27,10 @@ from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.checkpoint import CHECKPOINT_FILE, CheckpointError, CheckpointFile, read_checkpoint
 from ccatp.records.store import MissionStore
-from ccatp.survey.behaviours import MissionCommand
+from ccatp.survey.behaviours import MissionCommand, Settling
 from ccatp.survey.budget import BudgetProgress, TimeBudget
 from ccatp.survey.composition import Checkpoint, SurveyParts
+from ccatp.survey.engagement import Held, Levels
 from ccatp.survey.events import (
     Abort,
     Fault,
@@ -42,7 +43,7 @@ from ccatp.survey.events import (
     TakenOver,
 )
 from ccatp.survey.planning.route import Route
-from ccatp.survey.state import FixNeed, SurveyState
+from ccatp.survey.state import OnRoute, SurveyPhase, SurveyState
 from tests.faults.linking import Measured
 from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
@@ -131,8 +132,9 @@ def taken_over(story: Story, **event: Any) -> SurveyState:
     """What another main loop begins with."""
     survey, state = story.mission.survey, story.mission.state
     after, _ = survey.handle(state, TakenOver(**{"measured": state.done, "skipped": state.skipped, **event}))
-    assert after.fix is FixNeed.RELOCALIZE
-    assert (after.behaviour, after.corrected, after.interlock, after.severity) == (None, None, False, Severity.NONE)
+    assert after.is_lost
+    assert after.mode in (Mode.IDLE, Mode.HELD)
+    assert (after.course, after.interlock, after.levels) == (OnRoute(), False, Levels())
     return after
 
 
@@ -357,17 +359,19 @@ def test_the_checkpoint_is_due_ten_times_a_second_and_at_each_hold_or_abort(driv
     assert found.state == structs.replace(mission.state, route=Route((), (0.0,)), done=())
 
 
-@pytest.mark.parametrize("change", ["none", "number of the format", "cause", "abort_cause", "finding"])
+@pytest.mark.parametrize("change", ["none", "number of the format", "mode", "cause", "abort_cause", "finding"])
 def test_a_checkpoint_of_an_older_format_is_refused(driving: Story, tmp_path: Path, change: str) -> None:
-    """In formats 1 and 2 causes were texts, and the state is an array, so that nothing may be read by its place."""
+    """In formats 1 and 2 causes were texts, in format 3 the mode had flags beside it."""
     found = Checkpoint(1, 1, 0.01, 0.01, DeckPose(0.0, 0.0, 0.0), 1e-4, 1e-3, 0.0, 0.0, driving.mission.state)
     record = msgspec.msgpack.decode(msgspec.msgpack.encode(found))
-    assert record[0] == 3
+    assert record[0] == 4
     if change == "number of the format":
-        record[0] = 2
+        record[0] = 3
+    elif change == "mode":
+        record[1 + Checkpoint.__struct_fields__.index("state")]["mode"] = "driving"
     elif change != "none":
         state = record[1 + Checkpoint.__struct_fields__.index("state")]
-        state[SurveyState.__struct_fields__.index(change)] = "earthquake"
+        state[change] = "earthquake"
     file = CheckpointFile(tmp_path / CHECKPOINT_FILE, is_patient=True)
     for _ in range(2):
         file.write(record)
@@ -380,19 +384,19 @@ def test_a_checkpoint_of_an_older_format_is_refused(driving: Story, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("state", "v", "omega", "sigmas"),
+    ("phase", "v", "omega", "sigmas"),
     [
-        (Mode.SETTLING, 0.0, 0.0, (0.005, 0.010)),
-        (Mode.HELD, 0.0019, -0.0099, (0.005, 0.010)),
-        (Mode.HELD, -0.002, 0.0, (0.0110, 0.0905)),
-        (Mode.HELD, 0.0, 0.01, (0.0103, 0.0950)),
-        (Mode.DRIVING, 0.0, 0.0, (0.0103, 0.0905)),
-        (Mode.DRIVING, -0.1, 0.5, (0.0542, 0.3152)),
+        (Settling(), 0.0, 0.0, (0.005, 0.010)),
+        (Held(), 0.0019, -0.0099, (0.005, 0.010)),
+        (Held(), -0.002, 0.0, (0.0110, 0.0905)),
+        (Held(), 0.0, 0.01, (0.0103, 0.0950)),
+        (None, 0.0, 0.0, (0.0103, 0.0905)),  # drives
+        (None, -0.1, 0.5, (0.0542, 0.3152)),
     ],
 )
 def test_a_robot_that_was_not_observed_may_be_elsewhere(
-    driving: Story, state: Mode, v: float, omega: float, sigmas: tuple[float, float]
+    driving: Story, phase: SurveyPhase | None, v: float, omega: float, sigmas: tuple[float, float]
 ) -> None:
-    survey_state = structs.replace(driving.mission.state, mode=state)
+    survey_state = driving.mission.state if phase is None else structs.replace(driving.mission.state, phase=phase)
     found = Checkpoint(1, 1, 0.01, 0.01, DeckPose(0.0, 0.0, 0.0), 1e-4, 1e-3, v, omega, survey_state)
     assert found.sigmas(driving.config.limits) == pytest.approx(sigmas, abs=1e-4)  # as they are written here

@@ -21,8 +21,8 @@ from ccatp.daemon.operator.terminal import next_text, status_rows
 from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import MissionStatus
+from ccatp.survey.engagement import Engagement, Kind, Phase
 from ccatp.survey.events import WAITS_FOR, Mode, waits_for
-from ccatp.survey.state import HoldState
 
 
 @contextmanager
@@ -62,14 +62,24 @@ def test_a_process_that_failed_publishes_no_end_of_the_run(loop: MainLoop) -> No
     assert loop.status().exit_status == -1
 
 
-def standing(mode: StrEnum, said: list[str]) -> SimpleNamespace:
+class Standing(Phase, frozen=True, tag=True):
+    at: Mode | BeaconMode
+
+    kind = Kind.WORK
+
+    @property
+    def mode(self) -> StrEnum:
+        return self.at
+
+
+def standing(mode: Mode | BeaconMode, said: list[str]) -> SimpleNamespace:
     """A runner whose robot stands in a mode, with nothing wrong."""
     telemetry = SimpleNamespace(
         flush=lambda _: None, send=lambda *_: None, seq=-1, notify_operator=lambda _, text: said.append(text)
     )
     return SimpleNamespace(
         telemetry=telemetry,
-        mission=SimpleNamespace(state=HoldState(mode=mode)),
+        mission=SimpleNamespace(state=Engagement(Standing(mode))),
         causes=(),
         is_at_rest=True,
         is_busy=False,
@@ -81,7 +91,7 @@ def standing(mode: StrEnum, said: list[str]) -> SimpleNamespace:
 
 @pytest.mark.parametrize("mode", [*Mode, *BeaconMode])
 def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: StrEnum
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: Mode | BeaconMode
 ) -> None:
     said: list[str] = []
     now_s = 1000.0

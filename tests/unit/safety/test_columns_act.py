@@ -148,11 +148,11 @@ def test_a_fault_of_one_edge_sensor_is_looked_at_with_a_fix(row: Condition, monk
     verdict = verdict_of(row) if row.action is Action.LOCATE else escalated(row, LIMITS[row.limit])
     assert verdict.severity is Severity.HOLD
     config, mirror = config_of("fyst-m2"), mirror_of("fyst-m2")
-    assert reacted(config, mirror, verdict).has_looked
+    assert reacted(config, mirror, verdict).located
     changed = replace(row, action=Action.HOLD if row.action is Action.LOCATE else row.action, escalates_to=Action.FAULT)
     changed = replace(changed, escalates_to=Action.HOLD) if row.action is Action.PAUSE else changed
     monkeypatch.setitem(TABLE, row.name, changed)
-    assert not reacted(config, mirror, verdict).has_looked
+    assert not reacted(config, mirror, verdict).located
 
 
 @named([row for row in FOUND if row.clear is Clear.AFTER_FIX])

@@ -17,7 +17,7 @@ from ccatp.kinematics import difference
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.studies.sil_run import SilRun
-from ccatp.survey.behaviours import SETTLE_LIMIT_S, Retreat, RetreatStep, Settling, Standstill
+from ccatp.survey.behaviours import SETTLE_LIMIT_S, Measuring, Retreat, RetreatStep, Settling, Standstill
 from ccatp.survey.checks import PATIENCE_S, READINGS, MirrorCheck
 from ccatp.survey.events import Pause, Resume
 from ccatp.survey.fix_gate import ApproachCounter
@@ -32,14 +32,16 @@ class Standing:
     """Standing at a stop, as the survey keeps it."""
 
     def __init__(self, config: Config) -> None:
-        self._control, self.now, self.requests = config.control, Settling(), 0
+        self._control, self.requests = config.control, 0
+        self.settling, self.now = Settling(), Measuring()
 
     def has_settled(self, motion: StateEstimate) -> bool:
-        self.now = self.now.settle(self._control, MEASURING_S, motion)
-        return self.now.standstill.is_rest
+        self.settling = self.settling.update(self._control, motion)
+        self.now = Measuring.begin(self.settling, motion.t_s, MEASURING_S)
+        return self.settling.standstill.is_rest
 
     def is_due(self, motion: StateEstimate) -> bool:
-        self.now, is_due = self.now.measure(self._control, MEASURING_S, motion)
+        self.now, is_due = self.now.update(self._control, MEASURING_S, motion)
         self.requests += is_due
         return is_due
 
@@ -67,9 +69,7 @@ def test_a_robot_that_keeps_moving_is_not_measured_and_exceeds_its_limit(settlin
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
     frames = range(settled + 1, settled + 2000)
     assert [k for k in frames if settling.is_due(at(mirror, k, speed_m_s=0.01))] == []
-    limit = settled + round(SETTLE_LIMIT_S / DT)
-    assert not settling.now.is_overdue((limit - 1) * DT)
-    assert settling.now.is_overdue((limit + 1) * DT)
+    assert settling.now.rest_by_s == pytest.approx(settled * DT + SETTLE_LIMIT_S)
 
 
 @pytest.mark.fault("E9")

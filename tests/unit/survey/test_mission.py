@@ -1,7 +1,6 @@
 """The mission as stories in virtual time: an ideal robot on one panel, verdicts as told."""
 
 from collections.abc import Collection
-from itertools import product
 from math import copysign, cos, hypot, sin
 
 import pytest
@@ -19,14 +18,12 @@ from ccatp.survey.events import (
     FixFailed,
     FixStored,
     Interrupted,
-    MissionEvent,
     Mode,
     Pause,
     PointMissed,
     Resume,
     StopHere,
     SurveyOutcome,
-    next_state,
 )
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import Route
@@ -43,17 +40,6 @@ def config(config: Config) -> Config:
 @pytest.fixture
 def story(config: Config, mirror: Mirror) -> Story:
     return Story(config, mirror)
-
-
-def test_the_table_is_total_and_hold_is_one_event_away() -> None:
-    for state, event in product(Mode, MissionEvent):
-        assert next_state(state, event) in Mode
-    for state in set(Mode) - {Mode.DONE}:
-        assert next_state(state, MissionEvent.HOLD) is Mode.HELD
-    for state in set(Mode) - {Mode.BACKING_OFF, Mode.DONE}:
-        assert next_state(state, MissionEvent.EDGE) is Mode.BACKING_OFF
-    assert {next_state(Mode.DONE, event) for event in MissionEvent} == {Mode.DONE}
-    assert next_state(Mode.BACKING_OFF, MissionEvent.GO_HOME) is Mode.BACKING_OFF  # an edge outranks an abort
 
 
 def test_a_fix_at_the_start_comes_before_the_first_leg_and_costs_no_route(config: Config, mirror: Mirror) -> None:

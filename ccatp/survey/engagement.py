@@ -1,0 +1,393 @@
+"""Engagement: may the robot move, why is it held, who releases it, does it go home. The same for every mission. Pure.
+
+A mission is always in one phase. ``Ready``, ``Held``, ``Paused``, ``Faulted`` and ``Over`` are phases of every mission.
+The phases in which a mission works are its own: each is a value with what has a meaning in it alone, and of one kind.
+``TRANSITIONS`` has every change of the kind. What a verdict means is decided by the rows of ``failsafe.py``.
+"""
+
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+from math import inf
+from types import MappingProxyType
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import msgspec
+from msgspec.structs import replace
+
+from ccatp.conditions import EARTHQUAKE, NO_VERDICT, Action, text_of
+from ccatp.core import NO_CAUSE, NO_MOTION, Cause, EventCode, Permits, Severity, Verdict
+from ccatp.survey.events import (
+    DONE,
+    HELD,
+    IDLE,
+    Abort,
+    Fault,
+    Interrupted,
+    Pause,
+    Resume,
+    StopHere,
+    SurveyInput,
+    SurveyOutcome,
+)
+
+
+class Kind(StrEnum):
+    """Kinds of phases."""
+
+    READY = "ready"  # stands until motion is permitted for the first time
+    WORK = "work"  # does its task, or finds the robot's pose again for it
+    RETREAT = "retreat"  # leaves an edge
+    HOME = "home"  # drives home, to end there
+    HELD = "held"  # until the cause is gone
+    PAUSED = "paused"  # until an operator resumes
+    FAULTED = "faulted"  # the same, because of a fault
+    OVER = "over"
+
+
+class Event(StrEnum):
+    """What changes the kind of the phase. An event that the table does not list for a kind has no effect."""
+
+    GO_ON = "go on"  # the mission begins or continues its task, or looks for the pose
+    GO_HOME = "go home"
+    EDGE = "edge"  # an edge is declared
+    INTERRUPT = "interrupt"  # no motion, until the cause is gone
+    SHAKE = "shake"  # an earthquake
+    PAUSE = "pause"  # by an operator
+    FAULT = "fault"
+    FINISH = "finish"  # complete, at base after an abort, or stopped by an operator
+
+
+_ALWAYS = {Event.PAUSE: Kind.PAUSED, Event.FAULT: Kind.FAULTED, Event.FINISH: Kind.OVER}
+_BY_ITSELF = {Event.GO_ON: Kind.WORK, Event.SHAKE: Kind.HELD} | _ALWAYS
+_BY_OPERATOR = {Event.GO_ON: Kind.WORK, Event.GO_HOME: Kind.HOME, Event.FAULT: Kind.FAULTED, Event.FINISH: Kind.OVER}
+# Kind and event -> kind. An edge precedes the way home: in a retreat GO_HOME has no effect. OVER is final.
+TRANSITIONS: Mapping[Kind, Mapping[Event, Kind]] = MappingProxyType(
+    {
+        Kind.READY: _BY_ITSELF | {Event.GO_HOME: Kind.HOME, Event.EDGE: Kind.RETREAT},
+        Kind.WORK: _BY_ITSELF | {Event.GO_HOME: Kind.HOME, Event.EDGE: Kind.RETREAT, Event.INTERRUPT: Kind.HELD},
+        Kind.RETREAT: _BY_ITSELF | {Event.INTERRUPT: Kind.HELD},
+        Kind.HOME: _BY_ITSELF | {Event.EDGE: Kind.RETREAT, Event.INTERRUPT: Kind.HELD},
+        Kind.HELD: _BY_ITSELF | {Event.GO_HOME: Kind.HOME, Event.EDGE: Kind.RETREAT},
+        Kind.PAUSED: _BY_OPERATOR | {Event.PAUSE: Kind.PAUSED},
+        Kind.FAULTED: _BY_OPERATOR,
+        Kind.OVER: {},
+    }
+)
+MOVING = frozenset((Kind.WORK, Kind.RETREAT, Kind.HOME))
+
+
+class Phase(msgspec.Struct, frozen=True, tag=True):
+    """A phase of a mission."""
+
+    kind: ClassVar[Kind]
+    shown: ClassVar[StrEnum]  # its public name, in each phase of this class
+
+    @property
+    def mode(self) -> StrEnum:
+        """Public name of the phase."""
+        return self.shown
+
+
+class Ready(Phase, frozen=True, tag=True):
+    """The mission has not begun."""
+
+    kind, shown = Kind.READY, IDLE
+
+
+class Held(Phase, frozen=True, tag=True):
+    """Held until the cause is gone.
+
+    ``rejects_odometry``: the localizer ignores wheels and inertial unit, the robot stands. ``until_s``: the hold lasts
+    at least until then. ``stuck_s``: when a retreat ended without leaving the edge, ``None`` for another hold.
+    """
+
+    rejects_odometry: bool = False
+    until_s: float = -inf
+    stuck_s: float | None = None
+
+    kind, shown = Kind.HELD, HELD
+
+
+class Paused(Phase, frozen=True, tag=True):
+    """Held until an operator resumes."""
+
+    kind, shown = Kind.PAUSED, HELD
+
+
+class Faulted(Phase, frozen=True, tag=True):
+    """Held until an operator resumes, because of a fault."""
+
+    kind, shown = Kind.FAULTED, HELD
+
+
+class Over(Phase, frozen=True, tag=True):
+    """The mission has ended."""
+
+    outcome: SurveyOutcome
+
+    kind, shown = Kind.OVER, DONE
+
+
+class Levels(NamedTuple):
+    """What the newest verdict says, for events between two frames."""
+
+    severity: Severity = Severity.NONE
+    is_latched: bool = False  # an emergency is latched
+    is_shaking: bool = False  # an earthquake
+
+
+class Engagement(msgspec.Struct, frozen=True):
+    """The part of the state that all missions share. Times are robot time, s.
+
+    A verdict repeats in every frame what is acted on once: ``emergency_epoch``, ``finding`` and ``located``.
+    """
+
+    phase: Phase = Ready()
+    cause: Cause = NO_CAUSE  # why it is held, relocalizes, leaves an edge, goes home or has ended
+    abort_cause: Cause = NO_CAUSE  # why it goes home, as soon as it may
+    interlock: bool = False  # held by an earthquake; a retreat is still possible
+    levels: Levels = Levels()
+    is_slow: bool = False
+    full_fans: bool = False  # full fans from now on
+    emergency_epoch: int | None = 0  # the newest emergency acted on; None: take it from the first verdict
+    finding: Cause = NO_CAUSE  # the cause of the last return home
+    located: Cause = NO_CAUSE  # why a fix was taken for a sensor that stays off; until the severity is below hold
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of the phase."""
+        return self.phase.kind
+
+    @property
+    def mode(self) -> StrEnum:
+        """Public name of the phase."""
+        return self.phase.mode
+
+    @property
+    def outcome(self) -> SurveyOutcome:
+        """Outcome of the mission; NONE before its end."""
+        return self.phase.outcome if isinstance(self.phase, Over) else SurveyOutcome.NONE
+
+    @property
+    def is_held(self) -> bool:
+        """Held, by whatever and whoever."""
+        return self.phase.mode is HELD
+
+    @property
+    def rejects_odometry(self) -> bool:
+        """Held because wheels or inertial unit are not trusted."""
+        return isinstance(self.phase, Held) and self.phase.rejects_odometry
+
+    @property
+    def is_faulted(self) -> bool:
+        """A fault holds the robot."""
+        return self.phase.kind is Kind.FAULTED
+
+    @property
+    def is_held_by_hand(self) -> bool:
+        """Held until an operator resumes."""
+        return self.phase.kind in (Kind.PAUSED, Kind.FAULTED)
+
+    @property
+    def is_paused(self) -> bool:
+        """Held until an operator resumes, or reports that an earthquake is over."""
+        return self.is_held_by_hand or (self.interlock and self.phase.kind is Kind.HELD)
+
+    @property
+    def needs_fix(self) -> bool:
+        """The robot needs a fix before it moves on."""
+        return False
+
+    @property
+    def stands_for_fix(self) -> bool:
+        """The robot stands still for a fix that it needs."""
+        return False
+
+    @property
+    def is_recovering(self) -> bool:
+        """The robot leaves an edge or looks for its pose, which comes before going home."""
+        return self.phase.kind is Kind.RETREAT or self.needs_fix
+
+    def permits(self, verdict: Verdict | None) -> Permits:
+        """The motion that phase and verdict in force permit; a verdict alone does not say what the motion is for."""
+        return NO_MOTION if verdict is None or self.phase.kind not in MOVING else verdict.permits
+
+
+NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
+NONE, HOLD, RETURN, FAULT = Severity.NONE, Severity.HOLD, Severity.RETURN, Severity.FAULT
+S = TypeVar("S", bound=Engagement)
+# Used instead of a verdict when none is fresh enough.
+NO_FRESH_VERDICT = NO_VERDICT.found("verdict", 0.0, 0.0).verdict(-1, 0.0, EventCode.NORMAL)
+
+
+def enter(s: S, event: Event, phase: Phase) -> S:
+    """The state in ``phase`` if the table has it for the event in the present phase, else the same state."""
+    return replace(s, phase=phase) if TRANSITIONS[s.phase.kind].get(event) is phase.kind else s
+
+
+class Row(NamedTuple):
+    """One reaction of a mission to a verdict.
+
+    ``applies``: whether the row applies to a state and a verdict; ``when`` describes this. ``react``: from the rules, a
+    state, the frame and the verdict to the next state, and whether the rows below are skipped in this frame.
+    """
+
+    when: str
+    action: Action
+    applies: Callable[[Any, Verdict], bool]
+    react: Callable[[Any, Any, Any, Verdict], tuple[Any, bool]]
+
+
+class EngagementRules(Generic[S]):
+    """Holding, continuing and going home. ``rows``: reactions in the order of precedence.
+
+    A mission says what it does when it may continue (``proceed``), and what follows from a pose that is not trusted.
+    """
+
+    rows: tuple[Row, ...]
+
+    # -- transitions --------------------------------------------------------------------------------------------------
+
+    def pause(self, s: S, cause: Cause) -> S:
+        """Hold until an operator resumes; a fault remains one."""
+        return enter(replace(s, cause=cause), Event.PAUSE, Paused())
+
+    def interrupt(self, s: S, cause: Cause, *, stuck_s: float | None = None) -> S:
+        """Hold until the cause is gone; no effect in a phase in which the robot stands anyway."""
+        after = enter(s, Event.INTERRUPT, Held(stuck_s=stuck_s))
+        return s if after is s else replace(after, cause=cause)
+
+    def fault(self, s: S, cause: Cause, *, loses_pose: bool = False) -> S:
+        """Hold until an operator resumes, because of a fault. With ``loses_pose`` the robot relocalizes then."""
+        if s.kind is Kind.OVER:
+            return s
+        s = self.lose_pose(s) if loses_pose and not s.needs_fix else s
+        return enter(replace(s, cause=cause), Event.FAULT, Faulted())
+
+    def shake(self, s: S, cause: Cause) -> S:
+        """Hold in an earthquake. Afterwards the robot relocalizes, because it may have slipped, and drives home."""
+        if s.interlock or s.kind is Kind.OVER:
+            return s
+        s = self.lose_pose(replace(s, interlock=True, cause=cause, abort_cause=s.abort_cause or cause))
+        held = s.phase if isinstance(s.phase, Held) else Held()
+        return enter(s, Event.SHAKE, replace(held, rejects_odometry=False))
+
+    def await_recovery(
+        self, s: S, cause: Cause, *, rejects_odometry: bool = False, relocalizes: bool = True, until_s: float = -inf
+    ) -> S:
+        """Hold until the cause is gone, and not before ``until_s``; then relocalize before moving on."""
+        if s.kind is Kind.OVER or s.is_held_by_hand:
+            return s
+        s = replace(self.interrupt(s, cause), cause=cause)
+        s = self.lose_pose(s, doubts_odometry=False) if relocalizes else s
+        if not isinstance(s.phase, Held):
+            return s
+        rejects_odometry |= s.phase.rejects_odometry
+        return replace(
+            s, phase=replace(s.phase, rejects_odometry=rejects_odometry, until_s=max(s.phase.until_s, until_s))
+        )
+
+    def abort(self, s: S, cause: Cause) -> S:
+        """Return to base and end there."""
+        if s.kind is Kind.OVER:
+            return s
+        is_new = not s.abort_cause
+        s = replace(s, abort_cause=s.abort_cause or cause)
+        if s.interlock:
+            return s  # it goes home when the interlock is released
+        return self.proceed(s) if s.is_held or (is_new and not s.is_recovering) else s
+
+    def finish(self, s: S, outcome: SurveyOutcome) -> S:
+        """End the mission."""
+        return enter(s, Event.FINISH, Over(outcome))
+
+    def proceed(self, s: S) -> S:
+        """Change to the next task."""
+        raise NotImplementedError
+
+    def lose_pose(self, s: S, *, doubts_odometry: bool = True) -> S:
+        """Mark the pose as not trusted; with ``doubts_odometry`` the localizer inflates its covariance."""
+        del doubts_odometry
+        return s
+
+    # -- events between two frames ------------------------------------------------------------------------------------
+
+    def handle(self, s: S, event: SurveyInput) -> tuple[S, str | None]:
+        """The state after an event between two frames, and why it was refused, or ``None``."""
+        match event:
+            case Interrupted(cause):
+                return self.interrupt(s, cause), None
+            case Fault(cause, loses_pose):
+                return self.fault(s, cause, loses_pose=loses_pose), None
+            case Resume():
+                refusal = _resume_refusal(s)
+                return (self.proceed(s), None) if refusal is None else (s, refusal)
+            case Pause() | Abort() | StopHere() if s.kind is Kind.OVER:
+                return s, "the mission is over"
+            case Pause(cause):
+                return self.pause(s, cause), None
+            case Abort(cause):
+                return self.abort(s, cause), None
+        return self.finish(s, SurveyOutcome.STOPPED), None
+
+    # -- verdicts -----------------------------------------------------------------------------------------------------
+
+    def react(self, s: S, frame: Any, verdict: Verdict | None) -> S:
+        """React to the verdict in force (``None``: none is fresh enough) in a frame at ``frame.t_s``."""
+        if verdict is None or not _is_routine(s, verdict):
+            s = s if verdict is None else _with_levels(s, verdict)
+            v = verdict or NO_FRESH_VERDICT
+            for row in self.rows:
+                if row.applies(s, v):
+                    s, is_over = row.react(self, s, frame, v)
+                    if is_over:
+                        return s
+        phase = s.phase
+        is_free = phase.kind is Kind.READY or (isinstance(phase, Held) and frame.t_s >= phase.until_s)
+        return self.proceed(s) if is_free else s
+
+
+def _resume_refusal(s: Engagement) -> str | None:
+    severity, is_latched, is_shaking = s.levels
+    if not s.is_held:
+        return f"the mission is not held but {s.mode}"
+    if s.interlock or is_shaking:
+        return f"{EARTHQUAKE.message}: nothing moves until that is cleared"
+    if is_latched and not s.abort_cause:
+        return "an emergency of before is latched: 'ccatp clear' it first"
+    if severity >= HOLD and severity is not RETURN:
+        return f"the cause persists: {text_of(s.cause)}"
+    return None
+
+
+def _is_routine(s: Engagement, v: Verdict) -> bool:
+    """Whether no row applies, and nothing in the verdict has to be stored in the state."""
+    is_normal = (
+        not v.cause
+        and v.severity is NONE
+        and v.code is EventCode.NORMAL
+        and not (v.is_shaking or v.raised or v.full_fans)
+    )
+    was_normal = s.levels == _NORMAL and not (s.interlock or s.located or s.is_slow)
+    is_known = s.emergency_epoch is not None and not (isinstance(s.phase, Held) and s.phase.stuck_s is not None)
+    return is_normal and was_normal and is_known and v.forward and v.reverse and v.turn
+
+
+_NORMAL = Levels()
+
+
+def _with_levels(s: S, v: Verdict) -> S:
+    """Store the parts of a verdict that later frames need."""
+    epoch, full_fans = s.emergency_epoch, s.full_fans or v.full_fans or v.is_shaking
+    levels, interlock = Levels(v.severity, v.raised > 0, v.is_shaking), s.interlock and v.is_shaking
+    located = s.located if v.severity >= HOLD else NO_CAUSE
+    if epoch is not None and (levels, full_fans, located, interlock) == (s.levels, s.full_fans, s.located, s.interlock):
+        return s
+    return replace(
+        s,
+        levels=levels,
+        full_fans=full_fans,
+        located=located,
+        interlock=interlock,
+        emergency_epoch=v.raised if epoch is None else epoch,
+    )
