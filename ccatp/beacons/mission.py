@@ -142,7 +142,7 @@ class BeaconMission:
         if self._begun_s is None:
             self._begun_s = t_s
         self.state = RULES.react(self.state, measurements, verdict)
-        if verdict is None or is_denied(verdict) or self.state.mode in (HELD, DONE):
+        if verdict is None or not any(self.state.permits(verdict)):
             return HALT
         limit_s = self._cfg.mission.time_limit_s
         if t_s - self._begun_s > limit_s and self.state.mode is not IDLE and not self.state.abort_cause:

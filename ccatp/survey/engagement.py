@@ -57,23 +57,43 @@ class Event(StrEnum):
     FINISH = "finish"  # complete, at base after an abort, or stopped by an operator
 
 
-_ALWAYS = {Event.PAUSE: Kind.PAUSED, Event.FAULT: Kind.FAULTED, Event.FINISH: Kind.OVER}
-_BY_ITSELF = {Event.GO_ON: Kind.WORK, Event.SHAKE: Kind.HELD} | _ALWAYS
-_BY_OPERATOR = {Event.GO_ON: Kind.WORK, Event.GO_HOME: Kind.HOME, Event.FAULT: Kind.FAULTED, Event.FINISH: Kind.OVER}
+_STOPS = {Event.PAUSE: Kind.PAUSED, Event.FAULT: Kind.FAULTED, Event.FINISH: Kind.OVER}
+_BEGINS = {Event.GO_ON: Kind.WORK, Event.GO_HOME: Kind.HOME}
 # Kind and event -> kind. An edge precedes the way home: in a retreat GO_HOME has no effect. OVER is final.
 TRANSITIONS: Mapping[Kind, Mapping[Event, Kind]] = MappingProxyType(
     {
-        Kind.READY: _BY_ITSELF | {Event.GO_HOME: Kind.HOME, Event.EDGE: Kind.RETREAT},
-        Kind.WORK: _BY_ITSELF | {Event.GO_HOME: Kind.HOME, Event.EDGE: Kind.RETREAT, Event.INTERRUPT: Kind.HELD},
-        Kind.RETREAT: _BY_ITSELF | {Event.INTERRUPT: Kind.HELD},
-        Kind.HOME: _BY_ITSELF | {Event.EDGE: Kind.RETREAT, Event.INTERRUPT: Kind.HELD},
-        Kind.HELD: _BY_ITSELF | {Event.GO_HOME: Kind.HOME, Event.EDGE: Kind.RETREAT},
-        Kind.PAUSED: _BY_OPERATOR | {Event.PAUSE: Kind.PAUSED},
-        Kind.FAULTED: _BY_OPERATOR,
+        Kind.READY: _STOPS | _BEGINS | {Event.EDGE: Kind.RETREAT, Event.SHAKE: Kind.HELD},
+        Kind.WORK: _STOPS | _BEGINS | {Event.EDGE: Kind.RETREAT, Event.SHAKE: Kind.HELD, Event.INTERRUPT: Kind.HELD},
+        Kind.RETREAT: _STOPS | {Event.GO_ON: Kind.WORK, Event.SHAKE: Kind.HELD, Event.INTERRUPT: Kind.HELD},
+        Kind.HOME: _STOPS
+        | {Event.GO_ON: Kind.WORK, Event.EDGE: Kind.RETREAT, Event.SHAKE: Kind.HELD, Event.INTERRUPT: Kind.HELD},
+        Kind.HELD: _STOPS | _BEGINS | {Event.EDGE: Kind.RETREAT},
+        Kind.PAUSED: _BEGINS | {Event.FAULT: Kind.FAULTED, Event.FINISH: Kind.OVER},
+        Kind.FAULTED: _BEGINS | {Event.FINISH: Kind.OVER},
         Kind.OVER: {},
     }
 )
 MOVING = frozenset((Kind.WORK, Kind.RETREAT, Kind.HOME))
+
+
+class SummaryState(StrEnum):
+    """What an engineer of the observatory knows of every component; the names are those of the Rubin Observatory."""
+
+    OFFLINE = "offline"  # the mission is over, or no daemon runs
+    STANDBY = "standby"  # ready; it begins by itself when motion is permitted
+    DISABLED = "disabled"  # held by an operator, or until the observatory clears an earthquake
+    ENABLED = "enabled"  # at work or on the way home; also while it is held by a cause that ends by itself
+    FAULT = "fault"  # held until an operator has looked at the fault
+
+
+_SUMMARY = MappingProxyType(
+    {
+        Kind.READY: SummaryState.STANDBY,
+        Kind.PAUSED: SummaryState.DISABLED,
+        Kind.FAULTED: SummaryState.FAULT,
+        Kind.OVER: SummaryState.OFFLINE,
+    }
+)
 
 
 class Phase(msgspec.Struct, frozen=True, tag=True):
@@ -194,6 +214,12 @@ class Engagement(msgspec.Struct, frozen=True):
         return self.is_held_by_hand or (self.interlock and self.phase.kind is Kind.HELD)
 
     @property
+    def summary_state(self) -> SummaryState:
+        """The phase in the words of an observatory."""
+        is_disabled = self.interlock and self.phase.kind is Kind.HELD
+        return SummaryState.DISABLED if is_disabled else _SUMMARY.get(self.phase.kind, SummaryState.ENABLED)
+
+    @property
     def needs_fix(self) -> bool:
         """The robot needs a fix before it moves on."""
         return False
@@ -209,8 +235,12 @@ class Engagement(msgspec.Struct, frozen=True):
         return self.phase.kind is Kind.RETREAT or self.needs_fix
 
     def permits(self, verdict: Verdict | None) -> Permits:
-        """The motion that phase and verdict in force permit; a verdict alone does not say what the motion is for."""
-        return NO_MOTION if verdict is None or self.phase.kind not in MOVING else verdict.permits
+        """The motion that phase and verdict in force permit."""
+        kind = self.phase.kind
+        if verdict is None or kind not in MOVING:
+            return NO_MOTION
+        is_barred = verdict.is_shaking and not (kind is Kind.RETREAT and verdict.code is NEAR_EDGE)
+        return NO_MOTION if is_barred else verdict.permits
 
 
 NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
@@ -241,10 +271,12 @@ class Row(NamedTuple):
 class EngagementRules(Generic[S]):
     """Holding, continuing and going home. ``rows``: reactions in the order of precedence.
 
-    A mission says what it does when it may continue (``proceed``), and what follows from a pose that is not trusted.
+    A mission says what it does when it may continue, at an edge and at reduced speed, and what follows from a pose that
+    is not trusted. ``stuck_limit_s``: how long it waits at an edge that no motion helps to leave.
     """
 
     rows: tuple[Row, ...]
+    stuck_limit_s = inf
 
     # -- transitions --------------------------------------------------------------------------------------------------
 
@@ -269,8 +301,9 @@ class EngagementRules(Generic[S]):
         if s.interlock or s.kind is Kind.OVER:
             return s
         s = self.lose_pose(replace(s, interlock=True, cause=cause, abort_cause=s.abort_cause or cause))
-        held = s.phase if isinstance(s.phase, Held) else Held()
-        return enter(s, Event.SHAKE, replace(held, rejects_odometry=False))
+        if isinstance(s.phase, Held):
+            return replace(s, phase=replace(s.phase, rejects_odometry=False))
+        return enter(s, Event.SHAKE, Held())
 
     def await_recovery(
         self, s: S, cause: Cause, *, rejects_odometry: bool = False, relocalizes: bool = True, until_s: float = -inf
@@ -309,6 +342,14 @@ class EngagementRules(Generic[S]):
         """Mark the pose as not trusted; with ``doubts_odometry`` the localizer inflates its covariance."""
         del doubts_odometry
         return s
+
+    def change_speed(self, s: S, *, is_slow: bool) -> S:
+        """Reduce the speed now, or return to the usual speed."""
+        return replace(s, is_slow=is_slow)
+
+    def retreat(self, s: S, frame: Any, verdict: Verdict) -> S:
+        """Leave the edge that a verdict reports; for a mission that has a row for edges."""
+        raise NotImplementedError
 
     # -- events between two frames ------------------------------------------------------------------------------------
 

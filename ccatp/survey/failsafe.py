@@ -1,16 +1,14 @@
-"""Reactions of a mission to verdicts: the rows common to all missions, and the table of a survey.
+"""Reactions of a mission to verdicts: the rows common to all missions, and the table of a mission with edges.
 
 Rows are tried in order. A row's reaction either ends the frame or leaves it to the rows after it.
 """
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from msgspec.structs import replace
 
-from ccatp.conditions import BACK_OFFS, EARTHQUAKE, STUCK_AT_EDGE, Action, Clear, Condition, find_condition
+from ccatp.conditions import EARTHQUAKE, Action, Clear, Condition, find_condition
 from ccatp.core import Severity, Verdict
-from ccatp.safety.escalation import limit_s
-from ccatp.survey.behaviours import Retreat
 from ccatp.survey.engagement import (
     ABORTED,
     FAULT,
@@ -18,19 +16,13 @@ from ccatp.survey.engagement import (
     NEAR_EDGE,
     NO_FRESH_VERDICT,
     RETURN,
+    Engagement,
     EngagementRules,
-    Event,
     Held,
     Kind,
     Row,
     S,
-    enter,
 )
-from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import Lost, Returning, SurveyState, Travel
-
-if TYPE_CHECKING:
-    from ccatp.survey.statechart import Survey
 
 REDUCED = Severity.SLOW, RETURN
 # What ends a reaction without motion whose severity was raised, or is that of another row.
@@ -127,72 +119,50 @@ ON_EMERGENCY = Row(
 )
 
 
-# -- rows of a survey -------------------------------------------------------------------------------------------------
-
-Reaction = tuple[SurveyState, bool]  # the state, and whether that is all for this frame
+# -- rows of a mission with edges -------------------------------------------------------------------------------------
 
 
-def _locate(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict) -> Reaction:
+def _locate(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
     """Take one fix at rest: if the pose is wrong, a sensor that stays off may be over a seam or the rim."""
     if s.kind is Kind.OVER or s.is_held_by_hand:
         return s, False
     if not s.located:
-        s = survey.proceed(survey.await_recovery(replace(s, located=v.cause), v.cause))
+        s = rules.proceed(rules.await_recovery(replace(s, located=v.cause), v.cause))
     return s, s.stands_for_fix
 
 
-def _slow(_survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict) -> Reaction:
-    """Reduce the speed now, or return to the usual speed with the next leg."""
-    s = replace(s, is_slow=v.severity in REDUCED)
-    if s.is_slow and isinstance(s.phase, Travel) and not s.needs_fix:
-        s = replace(s, phase=Travel())
-    elif s.is_slow and isinstance(s.phase, Returning) and s.phase.way is not None:
-        s = replace(s, phase=Returning(s.phase.way.interrupted()))
-    return s, False
+def _change_speed(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
+    return rules.change_speed(s, is_slow=v.severity in REDUCED), False
 
 
-def _return(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict) -> Reaction:
+def _return(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
     """Abort once for each finding, which every verdict repeats."""
-    return survey.abort(replace(s, finding=v.cause), v.cause), False
+    return rules.abort(replace(s, finding=v.cause), v.cause), False
 
 
-def _is_stuck(s: SurveyState) -> bool:
+def _is_stuck(s: Engagement) -> bool:
     return isinstance(s.phase, Held) and s.phase.stuck_s is not None
 
 
-def _wait_at_edge(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict) -> Reaction:
+def _wait_at_edge(rules: EngagementRules[S], s: S, frame: Any, v: Verdict) -> tuple[S, bool]:
     """Wait after a retreat that did not leave the edge; a fault after the limit of the row."""
     held = s.phase
     if not isinstance(held, Held) or held.stuck_s is None:
         return s, False
     if v.code is not NEAR_EDGE and v is not NO_FRESH_VERDICT:
         return replace(s, phase=replace(held, stuck_s=None)), False
-    if motion.t_s - held.stuck_s > limit_s(STUCK_AT_EDGE, survey.cfg.health):
-        return survey.fault(s, s.cause), True
+    if frame.t_s - held.stuck_s > rules.stuck_limit_s:
+        return rules.fault(s, s.cause), True
     return s, True
 
 
-def _retreat(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict) -> Reaction:
+def _retreat(rules: EngagementRules[S], s: S, frame: object, v: Verdict) -> tuple[S, bool]:
     if s.kind in (Kind.RETREAT, Kind.OVER):
         return s, True
     if s.rejects_odometry:
-        s = survey.proceed(s)  # stand for a fix, which is always safe: without it the place of the edge is unknown
+        s = rules.proceed(s)  # stand for a fix, which is always safe: without it the place of the edge is unknown
     # The robot stands. If the map has the rim there, the pose may be wrong, and a fix is on its way.
-    if s.stands_for_fix or s.is_held_by_hand or motion.t_s < s.stands_until_s:
-        return s, True
-    mission, backoffs = survey.cfg.mission, s.backoffs + 1
-    if backoffs > mission.max_backoffs_per_stop:
-        return survey.fault(replace(s, backoffs=0), BACK_OFFS.cause(count=mission.max_backoffs_per_stop)), True
-    s = replace(
-        s,
-        backoffs=backoffs,
-        # At an edge again after a fix of the position: the heading must be wrong.
-        inflates_covariance=s.inflates_covariance or backoffs > 1,
-        cause=v.cause,
-        # The route avoids edges, so the pose is wrong: relocalize before moving on.
-        pose=s.pose if isinstance(s.pose, Lost) else Lost(),
-    )
-    return enter(s, Event.EDGE, Retreat.begin(mission, v, motion.pose, motion.rate_rad_s)), True
+    return (s, True) if s.stands_for_fix or s.is_held_by_hand else (rules.retreat(s, frame, v), True)
 
 
 ROWS = (
@@ -210,7 +180,7 @@ ROWS = (
         "the severity begins or ceases to be slow or return",
         Action.SLOW,
         lambda s, v: s.is_slow is not (v.severity in REDUCED) and v is not NO_FRESH_VERDICT,
-        _slow,
+        _change_speed,
     ),
     Row(
         "the severity is return for a new cause, and no edge is to be left",

@@ -11,6 +11,7 @@ from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase
 from ccatp.core import NO_CAUSE, Cause, EventCode, PointId, Stop, StopKind, Verdict
 from ccatp.mirror.mirror import Mirror
+from ccatp.safety.escalation import limit_s
 from ccatp.survey.behaviours import (
     HOLD_POSITION,
     STILL,
@@ -84,6 +85,7 @@ class Survey(EngagementRules[SurveyState]):
         self.cfg, self._route, self.planner = cfg, route, planner
         self._points = tuple(stop.point for stop in route.stops if stop.point is not None)
         self.follower = LegFollower(mirror, cfg)
+        self.stuck_limit_s = limit_s(conditions.STUCK_AT_EDGE, cfg.health)
         self._budget: TimeBudget | None = None
         if cfg.mission.holds_to_budget:
             self._budget = TimeBudget(cfg.run.budget_s, mirror, cfg.limits, cfg.etalon.measuring_time_s)
@@ -133,6 +135,8 @@ class Survey(EngagementRules[SurveyState]):
                     s, command = self._return(s, way, motion)
                 case Retreat() as retreat if verdict is not None:
                     s, command = self._back_off(s, retreat, motion, verdict)
+        if command.twist is not STILL and not any(s.permits(verdict)):
+            command = replace(command, twist=STILL)
         if s.inflates_covariance:
             s, command = replace(s, inflates_covariance=False), replace(command, inflates_covariance=True)
         return s, command
@@ -169,6 +173,34 @@ class Survey(EngagementRules[SurveyState]):
             due = tuple(point for point in reversed(tuple(s.failure_causes)) if point not in retried)
             retried = retried.union(due)
         return replace(s, due=due, retried=retried, course=OffRoute() if due else s.course)
+
+    def change_speed(self, s: SurveyState, *, is_slow: bool) -> SurveyState:
+        """Reduce the speed now, or return to the usual speed with the next leg."""
+        s = replace(s, is_slow=is_slow)
+        if is_slow and isinstance(s.phase, Travel) and not s.needs_fix:
+            return replace(s, phase=Travel())
+        if is_slow and isinstance(s.phase, Returning) and s.phase.way is not None:
+            return replace(s, phase=Returning(s.phase.way.interrupted()))
+        return s
+
+    def retreat(self, s: SurveyState, frame: StateEstimate, verdict: Verdict) -> SurveyState:
+        """Back off; at the same edge again and again it is a fault."""
+        if frame.t_s < s.stands_until_s:
+            return s
+        mission, backoffs = self.cfg.mission, s.backoffs + 1
+        if backoffs > mission.max_backoffs_per_stop:
+            cause = conditions.BACK_OFFS.cause(count=mission.max_backoffs_per_stop)
+            return self.fault(replace(s, backoffs=0), cause)
+        s = replace(
+            s,
+            backoffs=backoffs,
+            # At an edge again after a fix of the position: the heading must be wrong.
+            inflates_covariance=s.inflates_covariance or backoffs > 1,
+            cause=verdict.cause,
+            # The route avoids edges, so the pose is wrong: relocalize before moving on.
+            pose=s.pose if isinstance(s.pose, Lost) else Lost(),
+        )
+        return enter(s, Event.EDGE, Retreat.begin(mission, verdict, frame.pose, frame.rate_rad_s))
 
     # -- legs ---------------------------------------------------------------------------------------------------------
 

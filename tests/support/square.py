@@ -106,7 +106,7 @@ class Runner(mission_runner.MissionRunner):
     def plan(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
         mission, robot, (x, y, heading) = self.mission, self._cfg.robot, self._pose
         mission.state = Rules().react(mission.state, frame, verdict)
-        if mission.state.mode is not DRIVING or verdict is None or failsafe.is_denied(verdict):
+        if not all(mission.state.permits(verdict)):
             return self.hold(frame)
         self._lasts_s += frame.dt_s
         v, omega, until = (0.0, TURN_RAD_S, 0.5 * pi) if self._is_turning else (SPEED_M_S, 0.0, self._cfg.side_m)
