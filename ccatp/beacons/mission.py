@@ -15,13 +15,12 @@ from ccatp.conditions import Action
 from ccatp.core import NO_CAUSE, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
-from ccatp.survey.engagement import Engagement, EngagementRules, Event, Row, enter
+from ccatp.survey.engagement import EngagedMission, Engagement, EngagementRules, Event, Row, enter
 from ccatp.survey.events import (
     DONE,
     HELD,
     IDLE,
     RETURNING,
-    SurveyInput,
     SurveyOutcome,
 )
 from ccatp.survey.failsafe import (
@@ -84,13 +83,14 @@ class WaypointArrival(NamedTuple):
     belief: PoseBelief
 
 
-class BeaconMission:
+class BeaconMission(EngagedMission[Engagement]):
     """Maps and visits waypoints, or follows a radio; returns to its start when it is aborted.
 
     Call ``step`` once per frame. The robot must begin at the configured start.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
+        super().__init__(RULES, Engagement())
         self._cfg = cfg
         self.navigator: Navigator = MoteNavigator(cfg) if cfg.system == "cricket" else RadioNavigator(cfg)
         self.pilot = BeaconPilot(cfg)
@@ -99,19 +99,10 @@ class BeaconMission:
         self._begun_s: float | None = None
         self._followed_s = 0.0
         self._is_following = cfg.follow.is_active
-        self.state = Engagement()
-
-    def handle(self, event: SurveyInput) -> str | None:
-        """Handle an event between two frames. Returns the reason of a refusal, or ``None``."""
-        self.state, refusal = RULES.handle(self.state, event)
-        return refusal
-
-    def _finish(self, outcome: SurveyOutcome) -> None:
-        self.state = RULES.finish(self.state, outcome)
 
     def _work(self, task: BeaconMode) -> None:
         if self.state.mode is not task:
-            self.state = enter(self.state, Event.GO_ON, Working(task))
+            self._state = enter(self.state, Event.GO_ON, Working(task))
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
@@ -141,12 +132,12 @@ class BeaconMission:
         t_s = measurements.t_s
         if self._begun_s is None:
             self._begun_s = t_s
-        self.state = RULES.react(self.state, measurements, verdict)
+        self.react(measurements, verdict)
         if verdict is None or not any(self.state.permits(verdict)):
             return HALT
         limit_s = self._cfg.mission.time_limit_s
         if t_s - self._begun_s > limit_s and self.state.mode is not IDLE and not self.state.abort_cause:
-            self.state = RULES.fault(self.state, MISSION_TOO_LONG.cause(limit_s=limit_s))
+            self._state = RULES.fault(self.state, MISSION_TOO_LONG.cause(limit_s=limit_s))
             return HALT
         drive = self._wanted(measurements, interval_s)
         return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)
@@ -154,7 +145,7 @@ class BeaconMission:
     def _wanted(self, measurements: BeaconMeasurements, interval_s: float) -> SteeringCommand:
         if self.navigator.is_mapping:
             if self.state.abort_cause:
-                self._finish(SurveyOutcome.AT_BASE)  # it never left
+                self.finish(SurveyOutcome.AT_BASE)  # it never left
             else:
                 self._work(MAPPING)
             return HALT
@@ -171,7 +162,7 @@ class BeaconMission:
             self._work(FOLLOWING)
             self._followed_s += interval_s
             if self._followed_s >= self._cfg.mission.follow_s:
-                self._finish(SurveyOutcome.COMPLETE)
+                self.finish(SurveyOutcome.COMPLETE)
         return HALT if self.state.outcome is not SurveyOutcome.NONE else drive
 
     def _visit(self) -> None:
@@ -181,14 +172,14 @@ class BeaconMission:
             lap, waypoint = divmod(len(self.arrivals), len(waypoints))
             self.arrivals.append(WaypointArrival(waypoint, lap, waypoints[waypoint], self.navigator.belief))
         if len(self.arrivals) >= self.total:
-            self._finish(SurveyOutcome.COMPLETE)
+            self.finish(SurveyOutcome.COMPLETE)
 
     def _return(self, t_s: float, interval_s: float, distances_m: list[float]) -> SteeringCommand:
         if self._homing is None:
             self._homing = BeaconPilot(self._cfg, (self._cfg.start.x_m, self._cfg.start.y_m))
         drive = self._homing.drive(t_s, interval_s, self.navigator.belief.pose, None, distances_m)
         if self._homing.waypoints.current_m is None:
-            self._finish(SurveyOutcome.AT_BASE)
+            self.finish(SurveyOutcome.AT_BASE)
             return HALT
         return drive
 

@@ -146,7 +146,7 @@ class SurveyParts:
             raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")
 
 
-def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint | None = None) -> SurveyParts:
+def assemble(cfg: Config, done: Sequence[PointId] = (), checkpoint: Checkpoint | None = None) -> SurveyParts:
     """All pure parts; the robot is at base, or at the pose of ``checkpoint``.
 
     Raises ``PlanError``: unreachable point; ``ConfigError``: too little thrust.
@@ -160,7 +160,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint
     route = plan_survey(cfg, mirror, points, done, calibrates=checkpoint is None)
     survey = Survey(cfg, mirror, route, RoutePlanner(mirror, cfg))
     if checkpoint is None:
-        start, localizer, mission = None, build_localizer(cfg, mirror), Mission(survey)
+        start, localizer, mission = None, build_localizer(cfg, mirror), Mission(survey, survey.begin(done))
     else:
         start = checkpoint.pose, checkpoint.sigmas(cfg.limits)
         localizer, mission = build_with_uncertainty(cfg, mirror, *start), Mission(survey, checkpoint.state)
@@ -192,7 +192,7 @@ def take_over(cfg: Config, checkpoint: Checkpoint, event: TakenOver) -> SurveyPa
     """The parts of a main loop that continues where another one ended. Raises as ``assemble``."""
     # The state knows the points that failed and those without time.
     failed = () if event.is_new_run else (*checkpoint.state.failure_causes, *event.skipped)
-    parts = assemble(cfg, {*event.measured, *failed}, checkpoint)
+    parts = assemble(cfg, (*event.measured, *failed), checkpoint)
     parts.mission.handle(event)
     return parts
 

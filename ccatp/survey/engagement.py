@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from ccatp.conditions import EARTHQUAKE, NO_VERDICT, Action, text_of
+from ccatp.conditions import EARTHQUAKE, NO_VERDICT, Action, Owner, find_condition, text_of
 from ccatp.core import NO_CAUSE, NO_MOTION, Cause, EventCode, Permits, Severity, Verdict
 from ccatp.survey.events import (
     DONE,
@@ -357,6 +357,8 @@ class EngagementRules(Generic[S]):
         """The state after an event between two frames, and why it was refused, or ``None``."""
         match event:
             case Interrupted(cause):
+                if s.is_held and cause.condition != s.cause.condition and _is_of_main(s.cause) and _is_of_main(cause):
+                    return replace(s, cause=cause), None
                 return self.interrupt(s, cause), None
             case Fault(cause, loses_pose):
                 return self.fault(s, cause, loses_pose=loses_pose), None
@@ -386,6 +388,12 @@ class EngagementRules(Generic[S]):
         phase = s.phase
         is_free = phase.kind is Kind.READY or (isinstance(phase, Held) and frame.t_s >= phase.until_s)
         return self.proceed(s) if is_free else s
+
+
+def _is_of_main(cause: Cause) -> bool:
+    """Whether the main loop finds a cause: of several, the newest one counts."""
+    row = find_condition(cause.condition)
+    return row is not None and row.owner is Owner.MAIN
 
 
 def _resume_refusal(s: Engagement) -> str | None:
@@ -432,3 +440,29 @@ def _with_levels(s: S, v: Verdict) -> S:
         interlock=interlock,
         emergency_epoch=v.raised if epoch is None else epoch,
     )
+
+
+class EngagedMission(Generic[S]):
+    """The only owner of a mission's state, for the callers that send frames and those that send events."""
+
+    def __init__(self, rules: EngagementRules[S], state: S) -> None:
+        self._rules, self._state = rules, state
+
+    @property
+    def state(self) -> S:
+        """The present state."""
+        return self._state
+
+    def handle(self, event: SurveyInput) -> str | None:
+        """Apply an event between two frames; returns why it was refused, or ``None``."""
+        self._state, refusal = self._rules.handle(self._state, event)
+        return refusal
+
+    def react(self, frame: Any, verdict: Verdict | None) -> S:
+        """React to the verdict in force in a frame; the state after it."""
+        self._state = self._rules.react(self._state, frame, verdict)
+        return self._state
+
+    def finish(self, outcome: SurveyOutcome) -> None:
+        """End the mission."""
+        self._state = self._rules.finish(self._state, outcome)

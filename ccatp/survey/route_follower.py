@@ -1,7 +1,6 @@
 """Drives a leg (thesis 3.2) at the usual or the reduced speed; plans corrections and legs that show the heading."""
 
 import dataclasses
-from collections.abc import Callable
 from math import atan2, ceil, cos, hypot, pi, sin
 from operator import itemgetter
 from typing import NamedTuple
@@ -64,7 +63,7 @@ class StateEstimate(msgspec.Struct, frozen=True):
 
     ``creep``: drift (dx, dy) per metre of travel, in the plane of ``pose``. ``ahead``: predicted state, in the same
     plane, when the twist decided now takes effect; ``None``: at once. Steering uses ``ahead``; arrival and rest are
-    judged by ``pose``. ``sigma_of``: standard deviation of the position in its worst direction, m. ``turn_creep_of``:
+    judged by ``pose``. ``sigma_m``: standard deviation of the position in its worst direction. ``turn_creep_m_rad``:
     downhill creep per radian of a turn, mean over all headings, m. ``gap_s``: time without encoder samples since the
     last fix.
     """
@@ -72,14 +71,13 @@ class StateEstimate(msgspec.Struct, frozen=True):
     t_s: float
     dt_s: float
     pose: PanelPose
-    deck_of: Callable[[PanelPose], DeckPose]  # a function, because it is seldom needed and slow
     speed_m_s: float
     rate_rad_s: float
     creep: tuple[float, float] = (0.0, 0.0)
     ahead: Predicted | None = None
-    sigma_of: Callable[[], float] = float  # likewise
-    heading_sigma_of: Callable[[], float] = float
-    turn_creep_of: Callable[[], float] = float
+    sigma_m: float = 0.0
+    heading_sigma_rad: float = 0.0
+    turn_creep_m_rad: float = 0.0
     gap_s: float = 0.0
 
     @property
@@ -94,11 +92,6 @@ class StateEstimate(msgspec.Struct, frozen=True):
     def lead_rad(self) -> float:
         """Turn of the robot until the next twist takes effect."""
         return 0.0 if self.ahead is None else self.ahead.pose[2] - self.pose.heading_rad
-
-    @property
-    def deck(self) -> DeckPose:
-        """The pose in the deck frame."""
-        return self.deck_of(self.pose)
 
 
 class Leg(msgspec.Struct, frozen=True, tag=True):
@@ -131,6 +124,10 @@ class LegFollower:
         )
         self.tracker = LegTracker(cfg.control, limits, cfg.robot.wheel_lag_s, slow)
 
+    def deck_pose(self, motion: StateEstimate) -> DeckPose:
+        """The pose in the deck frame: not a part of the estimate, because it is seldom needed and takes 15 us."""
+        return self._mirror.deck_pose(motion.pose)
+
     def follow(self, leg: Leg, motion: StateEstimate, *, is_slow: bool) -> tuple[Leg, Twist]:
         """One frame of a leg: its new progress, and the twist until the next frame."""
         steered, panel, tracker = motion.ahead or motion.steered, motion.pose.panel, self.tracker
@@ -156,14 +153,14 @@ class LegFollower:
         The lateral part of this shift is limited. There is no shift if the clearance of turns covers the creep, or if
         a sensor would come too near to the rim. ``after``: the next stop, to which the robot turns.
         """
-        here, body = motion.deck, self._body
+        here, body = self.deck_pose(motion), self._body
         length_m, course = hypot(stop.x_m - here.x_m, stop.y_m - here.y_m), _course(here, stop)
         if after is None or stop.kind is not StopKind.VIA:
             return Leg(stop)
         arrival = course + (pi if stop.reverse else 0.0)
         turn_rad = difference(_course(stop, after) + (pi if after.reverse else 0.0), arrival)
         courses = np.linspace(arrival, arrival + turn_rad, 2 + int(abs(turn_rad) / _CREEP_STEP_RAD))
-        way_m, downhill = self._creep(stop, courses, motion.turn_creep_of() * abs(turn_rad))
+        way_m, downhill = self._creep(stop, courses, motion.turn_creep_m_rad * abs(turn_rad))
         if not body.turn_clearance_m < way_m < length_m:
             return Leg(stop)
         ahead_m = max(-way_m * cos(downhill - course), -0.5 * length_m)
@@ -185,12 +182,12 @@ class LegFollower:
 
     def begin_turn(self, leg: Leg, motion: StateEstimate, heading_rad: float, *, is_slow: bool) -> Leg:
         """Begin the turn to a deck heading at the end of a leg."""
-        tracked = self.tracker.begin_turn(difference(heading_rad, motion.deck.heading_rad), is_slow=is_slow)
+        tracked = self.tracker.begin_turn(difference(heading_rad, self.deck_pose(motion).heading_rad), is_slow=is_slow)
         return replace(leg, motion=tracked, deadline_s=self.deadline_s(motion.t_s, tracked))
 
     def turn(self, leg: Leg, tracked: LegMotion, motion: StateEstimate, heading_rad: float) -> tuple[Leg, Twist]:
         """One frame of the turn of ``begin_turn``."""
-        remaining = difference(heading_rad, motion.deck.heading_rad + motion.lead_rad)
+        remaining = difference(heading_rad, self.deck_pose(motion).heading_rad + motion.lead_rad)
         tracked, twist = self.tracker.step_turn(tracked, remaining, motion.dt_s, motion.steered.omega_rad_s)
         return replace(leg, motion=tracked), twist
 

@@ -23,7 +23,7 @@ from ccatp.survey.behaviours import (
     Settling,
 )
 from ccatp.survey.budget import BudgetProgress, TimeBudget
-from ccatp.survey.engagement import EngagementRules, Event, Faulted, Kind, Paused, Ready, enter
+from ccatp.survey.engagement import EngagedMission, EngagementRules, Event, Faulted, Kind, Paused, Ready, enter
 from ccatp.survey.events import (
     EmergencyKnown,
     EstimateDiverged,
@@ -92,9 +92,10 @@ class Survey(EngagementRules[SurveyState]):
         self._vague_m = cfg.mission.arrival_tolerance_m / _SURE_SIGMAS
         self._is_steered_bare = not (cfg.control.predicts_delay and cfg.control.compensates_creep)
 
-    def begin(self) -> SurveyState:
-        """The state before the first frame."""
-        return SurveyState(route=self._route, pose=Unconfirmed() if self.cfg.mission.fix_at_start else Located())
+    def begin(self, done: Sequence[PointId] = ()) -> SurveyState:
+        """The state before the first frame; ``done``: points measured in earlier runs."""
+        pose = Unconfirmed() if self.cfg.mission.fix_at_start else Located()
+        return SurveyState(route=self._route, pose=pose, done=tuple(done))
 
     def left_out(self, s: SurveyState) -> dict[PointId, str]:
         """Points that were skipped, or will not be measured any more, with the reason."""
@@ -224,7 +225,7 @@ class Survey(EngagementRules[SurveyState]):
         if command is not None:
             return s, command
         # Via points lie near the rim, where the turn needs the clearance that the route planned.
-        is_vague = stop.kind is StopKind.VIA and motion.sigma_of() > self.cfg.mission.via_sigma_m
+        is_vague = stop.kind is StopKind.VIA and motion.sigma_m > self.cfg.mission.via_sigma_m
         if stop.is_measured or is_vague:
             return self._arrive(s, motion)
         s = self.proceed(replace(s, stop_index=s.stop_index + 1))
@@ -240,7 +241,7 @@ class Survey(EngagementRules[SurveyState]):
         aside_m = self.follower.distance_m(s.stop if leg is None else leg.stop, motion.pose)
         if s.kind is Kind.HOME:
             limit_m, aside_m = mission.leg_clearance_m, mission.longest_leg_m
-        return _SURE_SIGMAS * hypot(motion.sigma_of(), aside_m * motion.heading_sigma_of()) > limit_m
+        return _SURE_SIGMAS * hypot(motion.sigma_m, aside_m * motion.heading_sigma_rad) > limit_m
 
     def _find(self, s: SurveyState) -> SurveyState:
         """Stand for a fix, which needs no motion."""
@@ -274,7 +275,7 @@ class Survey(EngagementRules[SurveyState]):
         """
         if leg is None or leg.motion is None or leg.motion.phase is not LegPhase.TURN:
             return False
-        if leg.stop.point is None or motion.sigma_of() <= self._vague_m:
+        if leg.stop.point is None or motion.sigma_m <= self._vague_m:
             return False
         is_long = leg.motion.planned_s > _LONG_TURN_S
         follower, reach_m = self.follower, self.cfg.mission.correction_reach_m
@@ -291,7 +292,8 @@ class Survey(EngagementRules[SurveyState]):
         """A short leg, with a fix at each end, shows the heading."""
         leg = _leg_of(s.phase)
         if leg is None:
-            stop = self.follower.heading_leg(motion.deck, motion.heading_sigma_of(), was_reverse=s.was_reverse)
+            deck = self.follower.deck_pose(motion)
+            stop = self.follower.heading_leg(deck, motion.heading_sigma_rad, was_reverse=s.was_reverse)
             legs_left = s.pose.legs_left - 1 if isinstance(s.pose, Lost) and stop is not None else 0
             pose = Lost(max(legs_left, 0)) if isinstance(s.pose, Lost) else s.pose
             if stop is None:
@@ -312,11 +314,11 @@ class Survey(EngagementRules[SurveyState]):
             return replace(s, course=Corrected(stop), phase=Travel(leg), corrections=s.corrections + 1)
         if not isinstance(s.course, Corrected) or s.course.stop is stop:
             return s
-        is_safe = self.follower.can_proceed(motion.deck, stop)
+        is_safe = self.follower.can_proceed(self.follower.deck_pose(motion), stop)
         return replace(s, course=OnRoute() if is_safe else OffRoute())
 
     def _find_route(self, s: SurveyState, motion: StateEstimate) -> Step:
-        stop, deck, due, command = s.stop, motion.deck, s.due[:CHUNK], HOLD_POSITION
+        stop, deck, due, command = s.stop, self.follower.deck_pose(motion), s.due[:CHUNK], HOLD_POSITION
         if stop is not None and stop.kind is StopKind.CALIBRATE:
             if is_on_drive(s.route.stops, deck.x_m, deck.y_m):
                 # Still on the calibration drive: continue it.
@@ -338,8 +340,9 @@ class Survey(EngagementRules[SurveyState]):
             return s, True
         rest = s.route.stops[s.stop_index :]
         left: Sequence[PointId] = s.due or [stop.point for stop in rest if stop.point is not None]
-        progress = budget.progress(s.budget, motion.deck, left)
-        going_on = budget.review(progress, motion.t_s, motion.deck, left)
+        deck = self.follower.deck_pose(motion)
+        progress = budget.progress(s.budget, deck, left)
+        going_on = budget.review(progress, motion.t_s, deck, left)
         s = replace(s, budget=progress)
         if going_on is None:
             cause = s.abort_cause or conditions.TIME_USED_UP.cause(budget_s=budget.budget_s)
@@ -391,7 +394,7 @@ class Survey(EngagementRules[SurveyState]):
             return self._find(s), HOLD_POSITION
         if way is None:
             try:
-                stops = self.planner.home(motion.deck)
+                stops = self.planner.home(self.follower.deck_pose(motion))
             except PlanError as error:
                 return self._without_way(s, conditions.NO_WAY_HOME.cause(why=error)), HOLD_POSITION
             return replace(s, phase=Returning(ReturnHome(stops)), is_confirmed=False), HOLD_POSITION
@@ -545,19 +548,14 @@ def _without(points: tuple[PointId, ...], point: PointId) -> tuple[PointId, ...]
     return tuple(other for other in points if other != point) if point in points else points
 
 
-class Mission:
-    """A running survey: its state, shared by the callers that send frames and those that send events."""
+class Mission(EngagedMission[SurveyState]):
+    """A running survey."""
 
     def __init__(self, survey: Survey, state: SurveyState | None = None) -> None:
+        super().__init__(survey, state or survey.begin())
         self.survey = survey
-        self.state = state or survey.begin()
 
     def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
         """One frame."""
-        self.state, command = self.survey.step(self.state, motion, verdict)
+        self._state, command = self.survey.step(self._state, motion, verdict)
         return command
-
-    def handle(self, event: SurveyInput) -> str | None:
-        """Apply an event between two frames; returns why it was refused, or ``None``."""
-        self.state, refusal = self.survey.handle(self.state, event)
-        return refusal

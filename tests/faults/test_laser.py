@@ -467,7 +467,7 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(
                         motion_s.append(story.t)
                     order = story.frame(FREE)
                     if order.measure:
-                        point, here = story.state.measuring_point, story.motion().deck
+                        point, here = story.state.measuring_point, story.deck()
                         service.begin(FixRequest(story.state.request, story.t, point, (0.0, 0.0, 0.0), here))
                     await asyncio.sleep(0.01)
                     if len(story.state.done) > done:

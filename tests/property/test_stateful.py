@@ -58,7 +58,7 @@ from ccatp.survey.events import (
 )
 from ccatp.survey.failsafe import ROWS
 from ccatp.survey.state import SurveyState
-from ccatp.survey.statechart import Survey
+from ccatp.survey.statechart import Mission, Survey
 from tests.property.stage import Stage
 from tests.support.mission_story import ABORT, FREE, FRONT_OFF, Story
 
@@ -328,7 +328,7 @@ def walk(config: Config, mirror: Mirror, seed: int, steps: int) -> int:
         after, command = survey.step(s, story.motion(), verdict)
         assert survey.step(s, story.motion(), verdict) == (after, command)  # of its arguments alone
         check(s, verdict, after, command)
-        story.mission.state = after
+        story.mission = Mission(survey, after)
         story.auto_fix = False
         story.move(command.twist)
         moved += command.twist != STILL

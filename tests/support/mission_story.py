@@ -72,7 +72,10 @@ class Story:
 
     def motion(self) -> StateEstimate:
         pose = PanelPose(PANEL, self.x, self.y, self.heading)
-        return StateEstimate(self.t, DT, pose, self.mirror.deck_pose, self.v, self.omega)
+        return StateEstimate(self.t, DT, pose, self.v, self.omega)
+
+    def deck(self) -> DeckPose:
+        return self.mirror.deck_pose(self.motion().pose)
 
     def frame(self, verdict: Verdict | None = FREE) -> MissionCommand:
         order = self.mission.step(self.motion(), verdict)

@@ -18,8 +18,8 @@ from ccatp.links import topics
 from ccatp.links.bus import Telemetry
 from ccatp.missions import MissionKind, Part
 from ccatp.survey import failsafe
-from ccatp.survey.engagement import Engagement, EngagementRules, Event, Kind, Phase, enter
-from ccatp.survey.events import DONE, DRIVING, SurveyInput, SurveyOutcome
+from ccatp.survey.engagement import EngagedMission, Engagement, EngagementRules, Event, Kind, Phase, enter
+from ccatp.survey.events import DONE, DRIVING, SurveyOutcome
 
 SPEED_M_S, TURN_RAD_S, SIDES = 0.05, 0.5, 4
 
@@ -65,19 +65,12 @@ class Rules(EngagementRules[Engagement]):
         return enter(replace(s, cause=NO_CAUSE), Event.GO_ON, Driving())
 
 
-class Mission:
-    state = Engagement()
-
-    def handle(self, event: SurveyInput) -> str | None:
-        self.state, refusal = Rules().handle(self.state, event)
-        return refusal
-
-
 class Runner(mission_runner.MissionRunner):
     """Drives each side, then turns by a right angle; ``_lasts_s``: how long it has driven the side, or turned."""
 
     def __init__(self, cfg: SquareConfig, host: mission_runner.MissionHost) -> None:
-        super().__init__(Mission(), Telemetry(host.publisher, host.log, "square_track", topics.TrackBatch))
+        telemetry = Telemetry(host.publisher, host.log, "square_track", topics.TrackBatch)
+        super().__init__(EngagedMission(Rules(), Engagement()), telemetry)
         self._cfg, self._host = cfg, host
         self._drive, self._pose = STILL, (0.0, 0.0, 0.0)
         self._sides, self._lasts_s, self._is_turning = 0, 0.0, False
@@ -105,15 +98,14 @@ class Runner(mission_runner.MissionRunner):
 
     def plan(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
         mission, robot, (x, y, heading) = self.mission, self._cfg.robot, self._pose
-        mission.state = Rules().react(mission.state, frame, verdict)
-        if not all(mission.state.permits(verdict)):
+        if not all(mission.react(frame, verdict).permits(verdict)):
             return self.hold(frame)
         self._lasts_s += frame.dt_s
         v, omega, until = (0.0, TURN_RAD_S, 0.5 * pi) if self._is_turning else (SPEED_M_S, 0.0, self._cfg.side_m)
         if self._lasts_s * (v + omega) >= until:
             self._lasts_s, self._is_turning, self._sides = 0.0, not self._is_turning, self._sides + self._is_turning
         if self._sides == SIDES:
-            mission.state = Rules().finish(mission.state, SurveyOutcome.COMPLETE)
+            mission.finish(SurveyOutcome.COMPLETE)
             return self.hold(frame)
         self._pose = x + v * cos(heading) * frame.dt_s, y + v * sin(heading) * frame.dt_s, heading + omega * frame.dt_s
         rates = (v + side * 0.5 * omega * robot.wheel_base_m for side in (1.0, -1.0))

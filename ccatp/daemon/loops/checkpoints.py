@@ -2,8 +2,6 @@
 
 from collections.abc import Collection, Sequence
 
-from msgspec.structs import replace
-
 from ccatp.conditions import RESTARTED
 from ccatp.config.models import Config
 from ccatp.core import Cause, PointId
@@ -41,7 +39,6 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
     skipped: tuple[PointId, ...] = ()
     if checkpoint is None:
         parts = assemble(cfg, measured)
-        parts.mission.state = replace(parts.mission.state, done=measured)
     elif args.is_restarted:
         skipped = tuple(stored.point for stored in store.points() if stored.status == "skipped")
         parts = take_over(cfg, checkpoint, TakenOver(measured, skipped, checkpoint.elapsed_s))

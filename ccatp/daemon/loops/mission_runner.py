@@ -21,8 +21,8 @@ from ccatp.errors import ExitStatus
 from ccatp.links.bus import Publisher, Telemetry
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import DisplayState, MissionStatus
-from ccatp.survey.engagement import Engagement
-from ccatp.survey.events import SurveyInput, SurveyOutcome
+from ccatp.survey.engagement import EngagedMission
+from ccatp.survey.events import SurveyOutcome
 
 EXIT_STATUS = {
     SurveyOutcome.COMPLETE: ExitStatus.COMPLETE,
@@ -97,26 +97,12 @@ class MissionHost(Protocol):
         """End the process with a status, after the last messages are sent."""
 
 
-class RunningMission(Protocol):
-    """What the main loop needs of a mission."""
-
-    @property
-    def state(self) -> Engagement:
-        """The present state."""
-
-    @state.setter
-    def state(self, state: Any) -> None: ...
-
-    def handle(self, event: SurveyInput) -> str | None:
-        """Handle an event between two frames; the reason of a refusal, or ``None``."""
-
-
 class MissionRunner(ABC):
     """A mission in the main-loop process. ``on_drive``: called with number and set points of each drive sent."""
 
     def __init__(
         self,
-        mission: RunningMission,
+        mission: EngagedMission[Any],
         telemetry: Telemetry,
         on_drive: Callable[[int, float, float], None] = lambda *_: None,
     ) -> None:

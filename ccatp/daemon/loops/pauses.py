@@ -23,8 +23,6 @@ class PauseWatch:
         mission, cause = self._runner.mission, row.cause(**values)
         before = mission.state
         mission.handle(Interrupted(cause))
-        if _own_pause_of(before) not in (None, row):
-            mission.state = replace(before, cause=cause)
         return mission.state is not before
 
     def escalate(self, now_s: float, *, counts: bool) -> None:

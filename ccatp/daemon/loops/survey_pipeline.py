@@ -85,22 +85,18 @@ class SurveyPipeline:
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self.sent.ahead(place, v, omega, echo.seq, echo_age_s=echo.age, is_held=echo.held, creep=creep)
-        sigmas_of = self.position_sigma_m, self.parts.heading_sigma_rad
-        deck_of, turn_creep_of = self.mirror.deck_pose, self.parts.turn_creep_m_rad
+        sigmas = localizer.position_sigma_m, self.parts.heading_sigma_rad()
+        turn_creep_m_rad = self.parts.turn_creep_m_rad()
         self.motion = StateEstimate(
-            frame.t_s, frame.dt_s, pose, deck_of, v, omega, creep, ahead, *sigmas_of, turn_creep_of, localizer.gap_s
+            frame.t_s, frame.dt_s, pose, v, omega, creep, ahead, *sigmas, turn_creep_m_rad, localizer.gap_s
         )
-
-    def position_sigma_m(self) -> float:
-        """Of the estimate now."""
-        return self.localizer.position_sigma_m
 
     def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
         """The drive for the mission's velocity, as far as the gate permits it."""
         mission, motion, sensors = self.mission, self.motion, frame.sensors
         if motion is None:
             raise RuntimeError("plan comes after estimate, and not for a stale frame")
-        mission.state, command = mission.survey.step(mission.state, motion, verdict)
+        command = mission.step(motion, verdict)
         state = mission.state
         if command.inflates_covariance or command.skips_calibration or state.full_fans or state.is_faulted:
             self._apply_requests(sensors, command)

@@ -44,6 +44,7 @@ from ccatp.survey.events import (
 )
 from ccatp.survey.planning.route import Route
 from ccatp.survey.state import OnRoute, SurveyPhase, SurveyState
+from ccatp.survey.statechart import Mission
 from tests.faults.linking import Measured
 from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
@@ -161,7 +162,7 @@ def test_an_earthquake_is_kept_by_the_danger_loop(driving: Story) -> None:
     assert driving.mission.state.is_paused
     after = taken_over(driving)
     assert (in_force(after), after.is_paused, after.full_fans) == (("emergency: earthquake", ""), False, True)
-    driving.mission.state = after
+    driving.mission = Mission(driving.mission.survey, after)
     driving.frame(QUAKE)
     assert driving.mission.state.is_paused
 
@@ -194,10 +195,11 @@ def test_what_failed_and_the_time_that_passed_outlive_a_process(driving: Story) 
     assert second
     assert third
     budget = BudgetProgress(begun_s=1.0, planned_s=50.0, next_s=5.0)
-    driving.mission.state = structs.replace(
+    state = structs.replace(
         driving.mission.state, skipped=(first,), failure_causes={first: "no lengths", third: "no time for it"},
         due=(first, second), retried=frozenset((first, third)), failures=2, backoffs=1, budget=budget, full_fans=True,
     )  # fmt: skip
+    driving.mission = Mission(driving.mission.survey, state)
     after = taken_over(driving, elapsed_s=80.0)
     kept = ("skipped", "failure_causes", "due", "retried", "failures", "backoffs", "full_fans", "request")
     for name in kept:
@@ -246,7 +248,7 @@ class Doomed(Story):
         self.frames += 1
         if self.frames in self.kills:
             done, skipped = mission.state.done, mission.state.skipped
-            mission.state, _ = self.survey.handle(self.kept, TakenOver(done, skipped, self.t))
+            self.mission = Mission(self.survey, self.survey.handle(self.kept, TakenOver(done, skipped, self.t))[0])
         return order
 
 
@@ -273,9 +275,10 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     one, two, three, *_ = (stop.point for stop in built.route.stops if stop.point is not None)
     store.record_fix(one, FIX, DeckPose(0.0, 0.0, 0.0)).result(5.0)
     store.record_skipped(two, 2.0).result(5.0)
-    built.mission.state = structs.replace(
+    state = structs.replace(
         built.mission.state, skipped=(two,), failure_causes={two: "no lengths", three: "no time for it"}
     )
+    built = replace(built, mission=Mission(built.mission.survey, state))
     assert built.mission.handle(Fault(Cause("a wheel is blocked"))) is None
     writer = CheckpointWriter(tmp_path, built.localizer, built.mission, is_patient=True)
     writer.boot = 7

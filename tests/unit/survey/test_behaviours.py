@@ -52,7 +52,7 @@ def settling(config: Config) -> Standing:
 
 
 def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> StateEstimate:
-    return StateEstimate(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
+    return StateEstimate(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), speed_m_s, 0.0)
 
 
 def test_a_measurement_is_requested_once_and_after_the_measuring_time_at_rest(
@@ -169,7 +169,7 @@ def test_a_leg_ends_uphill_of_where_the_next_turn_begins(
     start = mirror.panel_pose(PanelId(5, 5), DeckPose(0.5 - 0.3 * cos(downhill), 0.5 - 0.3 * sin(downhill), downhill))
     via = Stop(0.5, 0.5, StopKind.VIA)
     after = Stop(0.5 - 0.2 * sin(downhill), 0.5 + 0.2 * cos(downhill), StopKind.MEASURE)  # a quarter turn to the left
-    motion = StateEstimate(0.0, DT, start, mirror.deck_pose, 0.0, 0.0, turn_creep_of=lambda: creep_m_rad)
+    motion = StateEstimate(0.0, DT, start, 0.0, 0.0, turn_creep_m_rad=creep_m_rad)
     stop = follower.begin(motion, via, after).stop
     early_m = hypot(stop.x_m - via.x_m, stop.y_m - via.y_m)
     assert (early_m > config.mission.turn_clearance_m) is is_early
@@ -185,7 +185,7 @@ def test_beside_the_rim_it_does_not_end_where_a_sensor_would_pass_it(mirror: Mir
     via = Stop(x - 0.14, y - 0.15, StopKind.VIA)  # uphill of it is the rim
     after = Stop(via.x_m - 0.3, via.y_m, StopKind.MEASURE)
     start = mirror.panel_pose(mirror.nearest_panel(via.x_m, via.y_m - 0.3), DeckPose(via.x_m, via.y_m - 0.3, 0.0))
-    motion = StateEstimate(0.0, DT, start, mirror.deck_pose, 0.0, 0.0, turn_creep_of=lambda: 0.03)
+    motion = StateEstimate(0.0, DT, start, 0.0, 0.0, turn_creep_m_rad=0.03)
     assert follower.begin(motion, via, after).stop is via
 
 
@@ -238,10 +238,6 @@ def verdict_of(off: Four, *, may_turn: bool, row: Condition = RIM_AHEAD) -> Verd
     return Verdict(0, 0.0, code, row.cause(), "", 0.0, 0.0, forward, reverse, may_turn or is_free, off)
 
 
-def deck_of(pose: PanelPose) -> DeckPose:
-    return DeckPose(pose.x_m, pose.y_m, pose.heading_rad)
-
-
 def retreated(
     pose: Pose, *, may_turn: bool, blames: Four | None = None, row: Condition = RIM_AHEAD
 ) -> tuple[Pose, list[RetreatStep]]:
@@ -253,7 +249,7 @@ def retreated(
     for k in range(1500):
         if retreat.step in (RetreatStep.OVER, RetreatStep.STUCK):
             break
-        motion = StateEstimate(k * FRAME_S, FRAME_S, PanelPose(PANEL, *pose), deck_of, 0.0, rate_rad_s)
+        motion = StateEstimate(k * FRAME_S, FRAME_S, PanelPose(PANEL, *pose), 0.0, rate_rad_s)
         verdict = verdict_of(off_at(pose), may_turn=may_turn, row=row)
         retreat, twist = retreat.update(CFG.mission, tracker, motion, verdict, is_slow=False)
         rate_rad_s = twist.omega_rad_s

@@ -10,6 +10,7 @@ of the newest verdict only what a refusal to resume depends on, and of the numbe
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from enum import StrEnum
 from itertools import product
 from types import MappingProxyType, SimpleNamespace
 from typing import NamedTuple
@@ -75,7 +76,7 @@ class Task(Phase, frozen=True, tag=True):
     kind, shown = Kind.WORK, DRIVING
 
     @property
-    def mode(self) -> engagement.StrEnum:
+    def mode(self) -> StrEnum:
         return MEASURING if self.stands else DRIVING
 
 
@@ -336,7 +337,7 @@ def check_end(s: State) -> None:
     begun ends: a fix succeeds, a leg, a retreat and the way home end. An operator need not do anything.
     """
     for _ in range(8):
-        s = RULES.react(s, AFTER, FREE)  # type: ignore[arg-type]
+        s = RULES.react(s, AFTER, FREE)
         if s.kind in HANDS:
             assert s.cause
             return

@@ -78,9 +78,9 @@ def test_abort_goes_home_from_every_state(story: Story, state: Mode) -> None:
     story.until_state(Mode.DONE, ABORT)
     assert story.state.outcome is SurveyOutcome.AT_BASE
     assert text_of(story.state.cause) == "emergency: fire"
-    x, y = story.motion().deck.x_m, story.motion().deck.y_m
+    x, y = story.deck().x_m, story.deck().y_m
     assert hypot(x - story.base[0], y - story.base[1]) < 2e-3  # twice the arrival tolerance
-    assert story.motion().deck.heading_rad == pytest.approx(1.0, abs=0.011)  # heading tolerance and 1e-3 of frames
+    assert story.deck().heading_rad == pytest.approx(1.0, abs=0.011)  # heading tolerance and 1e-3 of frames
 
 
 def test_a_robot_that_is_held_because_the_laser_does_not_follow_goes_home_by_odometry(story: Story) -> None:
@@ -232,7 +232,7 @@ class Creeping(Story):
     """Turns leave the place uncertain."""
 
     def motion(self) -> StateEstimate:
-        return replace(super().motion(), sigma_of=lambda: self.sigma_m)
+        return replace(super().motion(), sigma_m=self.sigma_m)
 
     sigma_m = 0.0
 
@@ -469,7 +469,7 @@ class Gap(Story):
     gap_s, sigma_m, heading_sigma_rad = 0.0, 0.0, 0.0
 
     def motion(self) -> StateEstimate:
-        sigmas = {"sigma_of": lambda: self.sigma_m, "heading_sigma_of": lambda: self.heading_sigma_rad}
+        sigmas = {"sigma_m": self.sigma_m, "heading_sigma_rad": self.heading_sigma_rad}
         return replace(super().motion(), gap_s=self.gap_s, **sigmas)
 
     def frame(self, verdict: Verdict | None = FREE) -> MissionCommand:
