@@ -245,6 +245,7 @@ class MainLoop:
         status.bad_lines = link.counts["bad_lines"]
         status.bad_line = link.first_bad_line
         status.alarms = self._alarms.alarms.alarms
+        status.summary_state = str(self._runner.mission.state.summary_state)
         return status
 
     # -- what the mission and the operators need of this loop --------------------------------------------------------

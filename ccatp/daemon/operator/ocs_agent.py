@@ -35,7 +35,7 @@ ENDINGS: Mapping[int, str] = {
     ExitStatus.INTERRUPTED: "interrupted, the wheels are held",
 }
 # The feed always has the same fields (numbers and short texts): names in the feed and in the status.
-UNCHANGED = "state", "cause", "point", "done", "skipped", "total", "elapsed_s", "eta_s"
+UNCHANGED = "state", "summary_state", "cause", "point", "done", "skipped", "total", "elapsed_s", "eta_s"
 FEED_FIELDS = {
     **{name: name for name in UNCHANGED},
     "arrival_error_mm": "error_mm",

@@ -215,6 +215,7 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
     bad = f"{status.bad_lines} from the robot, the first: {status.bad_line}; 'ccatp conformance' checks the firmware"
     rows = [
         ("state", f"{status.state} {status.point}".strip()),
+        ("summary state", status.summary_state),
         ("cause", status.cause),
         ("severity", severity.name.lower() if severity else ""),
         ("next", next_text(status)),

@@ -45,6 +45,7 @@ def test_a_run_that_ended_publishes_its_status(loop: MainLoop) -> None:
     assert loop.status().exit_status == -1
     loop.finish(ExitStatus.HELD)
     assert loop.status().exit_status == ExitStatus.HELD
+    assert dict(status_rows(msgspec.to_builtins(loop.status())))["summary state"] == "enabled"
 
 
 def test_the_status_shows_the_first_bad_line_while_bad_lines_are_counted(loop: MainLoop) -> None:
