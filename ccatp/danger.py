@@ -21,9 +21,9 @@ from math import isfinite
 
 import msgspec
 
-from ccatp import conditions
 from ccatp.clocks import SteadyTime
 from ccatp.conditions import MonitorFinding
+from ccatp.conditions import danger as conditions
 from ccatp.config.models import Config, DangerConfig, HealthConfig, RobotConfig
 from ccatp.core import NO_MOTION, Corner, DeckPose, EdgeSample, EventCode, Permits, Verdict, WheelSample
 from ccatp.links.robot_messages import Sensors

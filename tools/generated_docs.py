@@ -15,7 +15,13 @@ import ccatp.onboard.devices.daq
 from ccatp.beacons.conditions import GROUP as BEACONS
 from ccatp.beacons.mission import RULES
 from ccatp.cli import cli
-from ccatp.conditions import SAMPLE_RATES, Action, Condition, Group, all_conditions
+from ccatp.conditions import (
+    Action,
+    Condition,
+    Group,
+    all_conditions,
+)
+from ccatp.conditions.danger import SAMPLE_RATES
 from ccatp.config.robot_limits import LIMITS
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervision.supervisor import PROCESSES

@@ -2,7 +2,17 @@
 
 from functools import partial
 
-from ccatp.conditions import ALONE, Action, Clear, Condition, Motion, Owner, fault, near, registered
+from ccatp.conditions import (
+    ALONE,
+    Action,
+    Clear,
+    Condition,
+    Motion,
+    Owner,
+    fault,
+    near,
+    registered,
+)
 
 GROUP = "Among beacons"
 

@@ -9,7 +9,8 @@ from math import dist
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from ccatp.conditions import SAMPLE_RATES, SENSOR_TOO_SLOW, text_of
+from ccatp.conditions import text_of
+from ccatp.conditions.danger import SAMPLE_RATES, SENSOR_TOO_SLOW
 from ccatp.config.models import Config
 from ccatp.control.grip_model import GripModel
 from ccatp.core import UNCHECKED, UNRELIABLE, Fix

@@ -7,7 +7,7 @@ verdict.
 from enum import Enum, StrEnum
 from math import isfinite
 
-from ccatp.conditions import FANS_REFUSED
+from ccatp.conditions.mission import FANS_REFUSED
 from ccatp.config.models import LimitsConfig, RobotConfig
 from ccatp.core import Cause, EventCode, Twist, Verdict
 from ccatp.kinematics import wheel_rates

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.conditions import FILTER_DIVERGED, FRAMES_BACKWARD, SENSOR_BACKWARD
+from ccatp.conditions.mission import FILTER_DIVERGED, FRAMES_BACKWARD, SENSOR_BACKWARD
 from ccatp.config.models import Config
 from ccatp.core import NO_CAUSE, Cause, EdgeSample, Fix, GravitySample, ImuSample, WheelSample
 from ccatp.estimation.fixes import DeckFoot, check_fix, deck_foot

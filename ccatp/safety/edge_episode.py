@@ -7,7 +7,13 @@ from enum import Enum, auto
 from math import cos, hypot, sin, sqrt
 from typing import NamedTuple
 
-from ccatp.conditions import BEYOND_SEAM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD, Condition
+from ccatp.conditions import Condition
+from ccatp.conditions.danger import (
+    BEYOND_SEAM,
+    NO_SEAM,
+    OFF_WITHOUT_WHEELS,
+    RIM_AHEAD,
+)
 from ccatp.config.models import DangerConfig
 from ccatp.safety.edge_map import Axis, EdgeMap, Place
 from ccatp.safety.wheel_odometry import Odometry

@@ -4,8 +4,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from math import hypot, inf
 
-from ccatp import conditions
 from ccatp.conditions import MonitorFinding
+from ccatp.conditions import danger as conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import Corner, DeckPose, EdgeSample, PanelId
 from ccatp.mirror.mirror import Mirror

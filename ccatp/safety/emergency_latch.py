@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import msgspec
 
-from ccatp.conditions import EARTHQUAKE, EMERGENCY, MonitorFinding
+from ccatp.conditions import MonitorFinding
+from ccatp.conditions.danger import EARTHQUAKE, EMERGENCY
 from ccatp.core import Cause, EmergencyKind, EventCode, Verdict
 from ccatp.links.channels import (
     BadRequest,

@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 
-from ccatp import conditions
+from ccatp.conditions import MonitorFinding
+from ccatp.conditions import danger as conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import GravitySample, ImuSample
 from ccatp.rest import LOADED_WHEEL_STANDS_RAD_S
@@ -37,14 +38,14 @@ class GripMonitor(Monitor):
         """See ``Monitor``."""
         super().reset()
         self._rule = SlideRule(self._slide_m_s, self._turn_rad)
-        self.finding: conditions.MonitorFinding | None = None
-        self.noise: conditions.MonitorFinding | None = None
+        self.finding: MonitorFinding | None = None
+        self.noise: MonitorFinding | None = None
         self._ahead = 0.0
         self._bias_m_s2 = 0.0
         self._speed_m_s = 0.0
         self._rested = 0
 
-    def findings(self, t_s: float) -> list[conditions.MonitorFinding]:
+    def findings(self, t_s: float) -> list[MonitorFinding]:
         """See ``Monitor``."""
         return [*super().findings(t_s), *(one for one in (self.finding, self.noise) if one is not None)]
 

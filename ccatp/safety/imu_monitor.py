@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 
-from ccatp import conditions
+from ccatp.conditions import MonitorFinding
+from ccatp.conditions import danger as conditions
 from ccatp.config.models import HealthConfig
 from ccatp.core import ImuSample
 from ccatp.rest import WHEEL_STANDS_RAD_S
@@ -49,7 +50,7 @@ class ImuMonitor(Monitor):
             return 0.0
         return (wz - self.bias_rad_s) * dt_s
 
-    def findings(self, t_s: float) -> list[conditions.MonitorFinding]:
+    def findings(self, t_s: float) -> list[MonitorFinding]:
         """See ``Monitor``."""
         found, gate = super().findings(t_s), self._gate
         if gate.cause:

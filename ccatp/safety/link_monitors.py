@@ -4,8 +4,9 @@ from collections import deque
 from collections.abc import Sequence
 from math import inf
 
-from ccatp import conditions
-from ccatp.conditions import SAMPLE_RATES, MonitorFinding
+from ccatp.conditions import MonitorFinding
+from ccatp.conditions import danger as conditions
+from ccatp.conditions.danger import SAMPLE_RATES
 from ccatp.config.models import HealthConfig
 from ccatp.core import EdgeSample, ImuSample, WheelSample
 from ccatp.links.robot_messages import Sensors

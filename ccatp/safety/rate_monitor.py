@@ -1,7 +1,8 @@
 """Monitor of the sample rates of the sensors."""
 
-from ccatp import conditions
-from ccatp.conditions import SAMPLE_RATES, MonitorFinding
+from ccatp.conditions import MonitorFinding
+from ccatp.conditions import danger as conditions
+from ccatp.conditions.danger import SAMPLE_RATES
 from ccatp.config.models import HealthConfig
 from ccatp.safety.monitor import Monitor
 

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from ccatp import conditions
 from ccatp.conditions import MonitorFinding
+from ccatp.conditions import danger as conditions
 from ccatp.config.models import HealthConfig
 from ccatp.safety.escalation import FindingLatch, Since
 from ccatp.safety.monitor import Monitor

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from ccatp.conditions import NO_FRAME
+from ccatp.conditions.danger import NO_FRAME
 from ccatp.core import NO_CAUSE, EventCode, Verdict
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage

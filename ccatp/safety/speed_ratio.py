@@ -4,7 +4,7 @@ from collections import deque
 from math import exp
 from typing import NamedTuple
 
-from ccatp import conditions
+from ccatp.conditions import danger as conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.safety.monitor import Monitor
 

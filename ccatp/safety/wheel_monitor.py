@@ -4,7 +4,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ccatp import conditions
+from ccatp.conditions import MonitorFinding
+from ccatp.conditions import danger as conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import WheelSample
 from ccatp.rest import AT_REST_M_S
@@ -188,7 +189,7 @@ class WheelMonitor(Monitor):
             self.alarm.see(t_s, conditions.WHEEL_RUNS_AWAY.found(f"{side}_wheel", worst, limit, side=side))
 
     @staticmethod
-    def _broken(side: str, value: float, limit: float, what: str) -> conditions.MonitorFinding:
+    def _broken(side: str, value: float, limit: float, what: str) -> MonitorFinding:
         return conditions.ENCODER_BROKEN.found(f"encoder_{side}", value, limit, side=side, what=what)
 
     def _find_stall(self, t_s: float, moved: MotionSum) -> None:

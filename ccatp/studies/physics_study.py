@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.conditions import GRIP_LOST
+from ccatp.conditions.danger import GRIP_LOST
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.grip_model import GripModel

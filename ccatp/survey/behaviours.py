@@ -6,7 +6,7 @@ from math import copysign, hypot
 import msgspec
 from msgspec.structs import replace
 
-from ccatp.conditions import RIM_AHEAD
+from ccatp.conditions.danger import RIM_AHEAD
 from ccatp.config.models import ControlConfig, MissionConfig
 from ccatp.control.tracker import LegMotion, LegPhase, LegTracker
 from ccatp.core import EventCode, PanelPose, PointId, Stop, StopKind, Twist, Verdict

@@ -14,7 +14,14 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from ccatp.conditions import EARTHQUAKE, NO_VERDICT, Action, Owner, find_condition, text_of
+from ccatp.conditions import (
+    Action,
+    Owner,
+    find_condition,
+    text_of,
+)
+from ccatp.conditions.danger import EARTHQUAKE
+from ccatp.conditions.mission import NO_VERDICT
 from ccatp.core import NO_CAUSE, NO_MOTION, Cause, EventCode, Permits, Severity, Verdict
 from ccatp.survey.events import (
     DONE,

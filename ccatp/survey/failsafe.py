@@ -7,7 +7,13 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from ccatp.conditions import EARTHQUAKE, Action, Clear, Condition, find_condition
+from ccatp.conditions import (
+    Action,
+    Clear,
+    Condition,
+    find_condition,
+)
+from ccatp.conditions.danger import EARTHQUAKE
 from ccatp.core import Severity, Verdict
 from ccatp.survey.engagement import (
     ABORTED,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.conditions import FRAME_REFUSED, LENGTHS_REFUSED
+from ccatp.conditions.mission import FRAME_REFUSED, LENGTHS_REFUSED
 from ccatp.config.models import FOUR_STATE, Config, EtalonConfig
 from ccatp.core import NO_CAUSE, Cause, DeckPose, Fix, FloatArray, PointId, Vector3
 from ccatp.estimation.fixes import DeckFoot, FixRefused, deck_foot

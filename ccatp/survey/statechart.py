@@ -5,7 +5,7 @@ from math import hypot
 
 from msgspec.structs import replace
 
-from ccatp import conditions
+from ccatp.conditions import mission as conditions
 from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase

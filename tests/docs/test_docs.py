@@ -39,11 +39,11 @@ def test_what_holds_the_robot_has_its_row_and_no_row_is_without_use() -> None:
     assert len(rows) == len(set(rows))
     folders = ("survey", "estimation", "daemon", "beacons", "control")
     paths = [path for name in folders for path in (ROOT / "ccatp" / name).glob("**/*.py")]
-    paths = [path for path in paths if path.name != "conditions.py"]  # rows
+    paths = [path for path in paths if path.name != "conditions.py" and path.parent.name != "conditions"]  # rows
     source = "\n".join(path.read_text(encoding="utf-8") for path in paths)
     calls = r"\b(?:fault|hold|interrupt|abort|_request_hold|Fault|Interrupted|Abort)\((?:self, |s, )?"
     texts = set(re.findall(calls + r'f?"([^"\n]*)"', source))
-    assert not texts, "rows for them in ccatp/conditions.py, then make docs"
+    assert not texts, "rows for them in ccatp/conditions/, then make docs"
 
 
 PLACES = {  # where the owner of a condition finds it

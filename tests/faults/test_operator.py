@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from ccatp.conditions import GRIP_TOO_LITTLE, text_of
+from ccatp.conditions import text_of
+from ccatp.conditions.danger import GRIP_TOO_LITTLE
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.loops.mission_runner import STILL, DriveCommand

@@ -13,20 +13,22 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 from msgspec.structs import replace
 
-from ccatp.conditions import (
+from ccatp.conditions import Action
+from ccatp.conditions.danger import (
     BATTERY_LOW,
     EARTHQUAKE,
     EDGE_SENSOR_STAYS_OFF,
     EDGE_STALE,
-    FANS_REFUSED,
-    FILTER_DIVERGED,
     FRAMES_LOST,
     GRIP_TOO_LITTLE,
-    NO_FRAME_FOR,
-    OPERATOR,
     SAMPLES_TOO_FEW,
     WHEELS_STAND,
-    Action,
+)
+from ccatp.conditions.mission import (
+    FANS_REFUSED,
+    FILTER_DIVERGED,
+    NO_FRAME_FOR,
+    OPERATOR,
 )
 from ccatp.config.load import load_config
 from ccatp.config.models import Config

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from msgspec.structs import replace
 
-from ccatp.conditions import EMERGENCY, RIM_AHEAD
+from ccatp.conditions.danger import EMERGENCY, RIM_AHEAD
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.mirror.mirror import Mirror

@@ -7,7 +7,9 @@ import pytest
 from msgspec.json import decode, encode
 from msgspec.structs import replace
 
-from ccatp.conditions import FAN_WEAK, MEASUREMENTS_FAILED, NO_ESTIMATE, Condition, all_conditions, text_of
+from ccatp.conditions import Condition, all_conditions, text_of
+from ccatp.conditions.danger import FAN_WEAK, NO_ESTIMATE
+from ccatp.conditions.mission import MEASUREMENTS_FAILED
 from ccatp.core import NO_CAUSE, Cause
 
 # A reference to another row, which an operator who reads one alarm does not see.

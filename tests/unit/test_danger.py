@@ -8,14 +8,14 @@ from weakref import ReferenceType, ref
 import pytest
 from msgspec.structs import astuple
 
-from ccatp.conditions import (
+from ccatp.conditions import text_of
+from ccatp.conditions.danger import (
     BEYOND_SEAM,
     CENTRE_NEAR_RIM,
     EDGE_SENSOR_CHATTERS,
     NO_SEAM,
     OFF_WITHOUT_WHEELS,
     RIM_AHEAD,
-    text_of,
 )
 from ccatp.config.models import Config
 from ccatp.core import Corner, DeckPose, EdgeSample, EventCode, Verdict, WheelSample

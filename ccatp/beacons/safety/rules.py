@@ -21,7 +21,8 @@ from ccatp.beacons.conditions import (
 )
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.links.messages import BeaconFrame, decode_beacon_frame
-from ccatp.conditions import ENCODERS_STALE, NO_FRAME, MonitorFinding
+from ccatp.conditions import MonitorFinding
+from ccatp.conditions.danger import ENCODERS_STALE, NO_FRAME
 from ccatp.core import EventCode, Permits, Verdict
 from ccatp.kinematics import wrap_pi
 from ccatp.links.robot_codec import BadLine

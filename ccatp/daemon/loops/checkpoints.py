@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Sequence
 
-from ccatp.conditions import RESTARTED
+from ccatp.conditions.mission import RESTARTED
 from ccatp.config.models import Config
 from ccatp.core import Cause, PointId
 from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE, active_ids

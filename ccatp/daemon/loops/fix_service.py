@@ -6,14 +6,14 @@ from dataclasses import asdict, dataclass
 from math import inf
 from typing import Any, Protocol
 
-from ccatp.conditions import (
+from ccatp.conditions import text_of
+from ccatp.conditions.mission import (
     DISK_STALLS,
     FIX_NOT_STORED,
     LASER_NOT_FOLLOWING,
     LASER_NOT_READY,
     METROLOGY_UNRELIABLE,
     SKIP_NOT_STORED,
-    text_of,
 )
 from ccatp.core import NO_CAUSE, UNRELIABLE, Cause, DeckPose, Fix, PointId, Vector3
 from ccatp.estimation.fixes import FixRefused

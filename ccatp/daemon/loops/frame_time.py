@@ -8,7 +8,8 @@ from collections.abc import Callable
 from math import inf
 from typing import Protocol
 
-from ccatp.conditions import FRAME_LATE, FRAMES_OLD, text_of
+from ccatp.conditions import text_of
+from ccatp.conditions.mission import FRAME_LATE, FRAMES_OLD
 from ccatp.config.models import LinkConfig
 from ccatp.core import Verdict
 from ccatp.daemon.loops.frame_lateness import FrameAge, LatenessStatistics

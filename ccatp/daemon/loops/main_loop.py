@@ -10,7 +10,8 @@ import zmq
 import zmq.asyncio
 
 from ccatp.clocks import MissionClock
-from ccatp.conditions import LINK_LOST, NO_FRAME_FOR, OPERATOR, text_of
+from ccatp.conditions import text_of
+from ccatp.conditions.mission import LINK_LOST, NO_FRAME_FOR, OPERATOR
 from ccatp.daemon.loops.alarm_watch import AlarmWatch
 from ccatp.daemon.loops.frame_time import DriveSender, FrameTime, LockstepTime, RealTime
 from ccatp.daemon.loops.mission_runner import STILL, LoopLimits, MissionHost, MissionRunner, TimedFrame

@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from ccatp.conditions import UNATTENDED_FAULT, text_of
+from ccatp.conditions import text_of
+from ccatp.conditions.mission import UNATTENDED_FAULT
 from ccatp.config.models import Config
 from ccatp.control.gate import FanGate
 from ccatp.core import Cause, Verdict

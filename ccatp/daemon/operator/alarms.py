@@ -16,7 +16,8 @@ from typing import Literal, NamedTuple, cast
 import msgspec
 import structlog
 
-from ccatp.conditions import OPERATOR, find_condition, text_of
+from ccatp.conditions import find_condition, text_of
+from ccatp.conditions.mission import OPERATOR
 from ccatp.config.files import read_text
 from ccatp.core import Cause, Severity
 from ccatp.links.topics import Alarm, SeverityName

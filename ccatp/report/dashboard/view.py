@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 import ccatp
-from ccatp.conditions import OPERATOR, danger_text, text_of
+from ccatp.conditions import danger_text, text_of
+from ccatp.conditions.mission import OPERATOR
 from ccatp.core import EmergencyKind, Verdict
 from ccatp.links import topics
 from ccatp.links.liveness import Liveness

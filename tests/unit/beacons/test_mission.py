@@ -23,7 +23,8 @@ from ccatp.beacons.sim.radio_world import RadioWorld
 from ccatp.beacons.sim.robot import BeaconRobot
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
-from ccatp.conditions import ENCODERS_STALE, text_of
+from ccatp.conditions import text_of
+from ccatp.conditions.danger import ENCODERS_STALE
 from ccatp.core import NO_CAUSE, Cause, EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_codec import BadLine, decode_from_robot

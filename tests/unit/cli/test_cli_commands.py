@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from ccatp.cli import main
-from ccatp.conditions import WHEEL_BLOCKED
+from ccatp.conditions.danger import WHEEL_BLOCKED
 from ccatp.config.load import available, load_config
 from ccatp.config.package import child_environment
 from ccatp.core import Severity

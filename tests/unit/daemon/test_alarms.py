@@ -16,8 +16,9 @@ import structlog
 from msgspec.structs import replace
 from structlog.testing import capture_logs
 
-from ccatp import conditions
+from ccatp.conditions import danger as conditions
 from ccatp.conditions import text_of
+from ccatp.conditions.mission import OPERATOR
 from ccatp.config.models import AlarmsConfig
 from ccatp.core import Cause, EmergencyKind, Severity
 from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
@@ -62,7 +63,7 @@ def shown(known: AlarmList) -> list[tuple[str, str]]:
     ("causes", "listed"),
     [
         ([], []),
-        ([(conditions.OPERATOR.cause(), NONE)], []),
+        ([(OPERATOR.cause(), NONE)], []),
         ([(SLOW, Severity.SLOW)], []),
         ([(FAN, NONE)], [("fan_weak", "return")]),
         ([(STALE, Severity.PAUSE)], []),

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from ccatp.conditions import EARTHQUAKE, text_of
+from ccatp.conditions import text_of
+from ccatp.conditions.danger import EARTHQUAKE
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, EventCode, Fix, PointId, Verdict

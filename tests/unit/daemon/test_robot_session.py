@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import LASER_NOT_READY
+from ccatp.conditions.mission import LASER_NOT_READY
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId

@@ -7,7 +7,13 @@ from typing import Any
 import pytest
 
 from ccatp.beacons.conditions import GROUP as BEACONS
-from ccatp.conditions import TABLE, Action, Clear, Condition, Motion
+from ccatp.conditions import (
+    TABLE,
+    Action,
+    Clear,
+    Condition,
+    Motion,
+)
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.operator.alarms import active_cause

@@ -10,9 +10,19 @@ from typing import Any
 
 import pytest
 
-from ccatp import conditions as rows
 from ccatp.beacons.conditions import GROUP as BEACONS
-from ccatp.conditions import ALONE, TABLE, Condition, Group, Motion, Owner, all_conditions, fault, text_of
+from ccatp.conditions import (
+    ALONE,
+    TABLE,
+    Condition,
+    Group,
+    Motion,
+    Owner,
+    all_conditions,
+    fault,
+    text_of,
+)
+from ccatp.conditions import danger as rows
 from ccatp.core import EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors

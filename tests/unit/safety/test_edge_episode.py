@@ -9,7 +9,13 @@ from unittest.mock import ANY
 
 import pytest
 
-from ccatp.conditions import BEYOND_SEAM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD, Condition
+from ccatp.conditions import Condition
+from ccatp.conditions.danger import (
+    BEYOND_SEAM,
+    NO_SEAM,
+    OFF_WITHOUT_WHEELS,
+    RIM_AHEAD,
+)
 from ccatp.config.load import load_config
 from ccatp.safety.edge_episode import DIRECTION_TRAVEL_M, LONG_ON, EdgeEpisode, EdgeLimits, EdgePhase, FoundEdge
 from ccatp.safety.edge_map import Axis, EdgeMap, SeamNear

@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from ccatp.conditions import (
-    ACCELEROMETER_DIFFERENCES,
-    GRIP_LITTLE,
-    GRIP_LOST,
-    GRIP_TOO_LITTLE,
     Clear,
     Condition,
     MonitorFinding,
     Motion,
+)
+from ccatp.conditions.danger import (
+    ACCELEROMETER_DIFFERENCES,
+    GRIP_LITTLE,
+    GRIP_LOST,
+    GRIP_TOO_LITTLE,
 )
 from ccatp.config.load import load_config
 from ccatp.config.models import Config

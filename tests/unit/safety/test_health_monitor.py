@@ -13,7 +13,7 @@ import pytest
 from pydantic import BaseModel
 
 import ccatp.safety
-from ccatp.conditions import FRAMES_LOST
+from ccatp.conditions.danger import FRAMES_LOST
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
 from ccatp.links.robot_messages import CommandEcho, Sensors

@@ -1,6 +1,6 @@
 """The danger rules of a robot that nothing but an emergency endangers."""
 
-from ccatp.conditions import NO_FRAME
+from ccatp.conditions.danger import NO_FRAME
 from ccatp.core import EventCode, Verdict
 from ccatp.links.topics import EstimateMessage
 from ccatp.safety.rules import SafetyRules, emergency_rules

@@ -5,7 +5,7 @@ from math import exp, floor, pi
 
 import pytest
 
-from ccatp.conditions import WHEEL_SPEED_WRONG
+from ccatp.conditions.danger import WHEEL_SPEED_WRONG
 from ccatp.safety.speed_ratio import SpeedRatioMonitor
 from tests.support.scenario import config_of
 

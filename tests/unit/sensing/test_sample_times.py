@@ -6,7 +6,8 @@ from math import inf, nan
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import EDGE_STALE, ENCODERS_STALE, SAMPLES_MISDATED, Condition, text_of
+from ccatp.conditions import Condition, text_of
+from ccatp.conditions.danger import EDGE_STALE, ENCODERS_STALE, SAMPLES_MISDATED
 from ccatp.core import EdgeSample, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import BEYOND_SEAM, NO_SEAM, RIM_AHEAD, Condition
+from ccatp.conditions import Condition
+from ccatp.conditions.danger import BEYOND_SEAM, NO_SEAM, RIM_AHEAD
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker

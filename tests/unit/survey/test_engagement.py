@@ -18,22 +18,24 @@ from typing import NamedTuple
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import (
+from ccatp.conditions.danger import (
     BATTERY_LOW,
     EARTHQUAKE,
     EDGE_SENSOR_STAYS_OFF,
     EDGE_STALE,
     EMERGENCY,
-    FILTER_DIVERGED,
     FRAMES_LOST,
     GRIP_TOO_LITTLE,
-    NO_FRAME_FOR,
-    OPERATOR,
     RIM_AHEAD,
     SAMPLES_TOO_FEW,
-    STUCK_AT_EDGE,
     UNKNOWN_REPORTED,
     WHEELS_STAND,
+)
+from ccatp.conditions.mission import (
+    FILTER_DIVERGED,
+    NO_FRAME_FOR,
+    OPERATOR,
+    STUCK_AT_EDGE,
 )
 from ccatp.core import Cause, EventCode, Severity, Verdict
 from ccatp.survey import engagement

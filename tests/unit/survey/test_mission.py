@@ -6,7 +6,8 @@ from math import copysign, cos, hypot, sin
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import EDGE_SENSOR_STAYS_OFF, ESTIMATE_NOT_FINITE, RIM_AHEAD, text_of
+from ccatp.conditions import text_of
+from ccatp.conditions.danger import EDGE_SENSOR_STAYS_OFF, ESTIMATE_NOT_FINITE, RIM_AHEAD
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, PointId, Predicted, Severity, Stop, StopKind, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
