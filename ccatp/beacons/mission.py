@@ -137,7 +137,7 @@ class BeaconMission(EngagedMission[Engagement]):
             return HALT
         limit_s = self._cfg.mission.time_limit_s
         if t_s - self._begun_s > limit_s and self.state.mode is not IDLE and not self.state.abort_cause:
-            self._state = RULES.fault(self.state, MISSION_TOO_LONG.cause(limit_s=limit_s))
+            self._state = RULES.meet(self.state, MISSION_TOO_LONG.cause(limit_s=limit_s))
             return HALT
         drive = self._wanted(measurements, interval_s)
         return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)

@@ -48,9 +48,10 @@ FANS_REFUSED = fault("fans_refused", Owner.MISSION, ALONE, Group.FANS, "fan comm
     "The robot would fall with the configured duty of its fans.", "Correct the configuration; start again.")
 
 LINK_LOST = wait("link_lost", Owner.LINK, ALONE, Group.LINK, "robot link lost: {reason}",
-    "The connection ended. The robot holds its wheels by itself; main reconnects for `robot.reconnect_timeout_s`.",
+    "The connection ended. The robot holds its wheels by itself; main reconnects for `robot.reconnect_timeout_s`. "
+    "A robot that rebooted, or may have moved meanwhile, is relocalized.",
     "Check network and robot. After that time the run ends with status 5; `--resume` continues it.",
-    clear=Clear.AFTER_FIX)
+    clear=Clear.AUTO)
 FRAMES_BACKWARD = diverged("frames_backward", Owner.LOCALIZER, ALONE, Group.LINK,
     "time stamps of the frames run backward",
     "Five in a row. The robot is held; repeated more than `health.retries` times, it is a fault.",

@@ -67,6 +67,14 @@ def limit_s(row: Condition, section: object) -> float:
     return float(getattr(section, row.limit.partition(".")[2]))
 
 
+def find_limit_s(row: Condition, cfg: object) -> float:
+    """The same from a whole configuration; infinite for a configuration without that key."""
+    value: Any = cfg
+    for name in row.limit.split("."):
+        value = getattr(value, name, inf)
+    return float(value)
+
+
 def gravest(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
     """The finding with the highest severity; of equal ones that of the lowest precedence number."""
     return max(findings, key=lambda finding: (finding.severity, -finding.condition.precedence), default=None)

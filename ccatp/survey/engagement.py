@@ -7,6 +7,7 @@ The phases in which a mission works are its own: each is a value with what has a
 
 from collections.abc import Callable, Mapping
 from enum import StrEnum
+from functools import partial
 from math import inf
 from types import MappingProxyType
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
@@ -14,12 +15,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from ccatp.conditions import (
-    Action,
-    Owner,
-    find_condition,
-    text_of,
-)
+from ccatp.conditions import Action, Clear, Motion, Owner, find_condition, text_of
 from ccatp.conditions.danger import EARTHQUAKE
 from ccatp.conditions.mission import NO_VERDICT
 from ccatp.core import NO_CAUSE, NO_MOTION, Cause, EventCode, Permits, Severity, Verdict
@@ -312,6 +308,33 @@ class EngagementRules(Generic[S]):
             return replace(s, phase=replace(s.phase, rejects_odometry=False))
         return enter(s, Event.SHAKE, Held())
 
+    def meet(
+        self,
+        s: S,
+        cause: Cause,
+        *,
+        usual: Clear = Clear.AUTO,
+        loses_pose: bool = False,
+        until_s: float = -inf,
+        stuck_s: float | None = None,
+    ) -> S:
+        """React to what the mission, its fixes or its loop have found, as motion and clear of its row say.
+
+        ``usual``: what ends the hold for a cause without a row. The others: as in ``fault``, ``await_recovery`` and
+        ``interrupt``.
+        """
+        row = find_condition(cause.condition)
+        motion, clear = (Motion.NONE, usual) if row is None else (row.motion, row.clear or Clear.AUTO)
+        if motion is Motion.ANY:
+            return s
+        if motion is not Motion.NONE:
+            return self.abort(s, cause)
+        if clear is Clear.OPERATOR:
+            return self.fault(s, cause, loses_pose=loses_pose)
+        if clear is Clear.AFTER_FIX:
+            return self.await_recovery(s, cause, until_s=until_s)
+        return self.interrupt(s, cause, stuck_s=stuck_s)
+
     def await_recovery(
         self, s: S, cause: Cause, *, rejects_odometry: bool = False, relocalizes: bool = True, until_s: float = -inf
     ) -> S:
@@ -366,9 +389,10 @@ class EngagementRules(Generic[S]):
             case Interrupted(cause):
                 if s.is_held and cause.condition != s.cause.condition and _is_of_main(s.cause) and _is_of_main(cause):
                     return replace(s, cause=cause), None
-                return self.interrupt(s, cause), None
+                return self.meet(s, cause), None
             case Fault(cause, loses_pose):
-                return self.fault(s, cause, loses_pose=loses_pose), None
+                react = self.fault if _is_raised(cause) else partial(self.meet, usual=Clear.OPERATOR)
+                return react(s, cause, loses_pose=loses_pose), None
             case Resume():
                 refusal = _resume_refusal(s)
                 return (self.proceed(s), None) if refusal is None else (s, refusal)
@@ -395,6 +419,12 @@ class EngagementRules(Generic[S]):
         phase = s.phase
         is_free = phase.kind is Kind.READY or (isinstance(phase, Held) and frame.t_s >= phase.until_s)
         return self.proceed(s) if is_free else s
+
+
+def _is_raised(cause: Cause) -> bool:
+    """Whether a fault is that of another severity that lasted."""
+    row = find_condition(cause.condition)
+    return row is not None and row.severity is not FAULT
 
 
 def _is_of_main(cause: Cause) -> bool:

@@ -92,6 +92,10 @@ def pause(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[
     return rules.interrupt(s, v.cause), True
 
 
+def _meet(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
+    return rules.meet(s, v.cause), True
+
+
 def _go_home(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
     """Abort once for each emergency, which every verdict repeats."""
     return rules.abort(replace(s, emergency_epoch=v.raised), v.cause), False
@@ -116,7 +120,7 @@ ON_UNKNOWN = Row(
     lambda _, v: bool(v.cause) and row_of(v) is None,
     _hold,
 )
-ON_NO_VERDICT = Row("no verdict is fresh enough", Action.PAUSE, lambda _, v: v is NO_FRESH_VERDICT, pause)
+ON_NO_VERDICT = Row("no verdict is fresh enough", Action.PAUSE, lambda _, v: v is NO_FRESH_VERDICT, _meet)
 ON_EMERGENCY = Row(
     "an emergency is new",
     Action.RETURN,

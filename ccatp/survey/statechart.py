@@ -5,8 +5,8 @@ from math import hypot
 
 from msgspec.structs import replace
 
+from ccatp.conditions import Clear, find_condition, text_of
 from ccatp.conditions import mission as conditions
-from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase
 from ccatp.core import NO_CAUSE, Cause, EventCode, PointId, Stop, StopKind, Verdict
@@ -85,7 +85,8 @@ class Survey(EngagementRules[SurveyState]):
         self.cfg, self._route, self.planner = cfg, route, planner
         self._points = tuple(stop.point for stop in route.stops if stop.point is not None)
         self.follower = LegFollower(mirror, cfg)
-        self.stuck_limit_s = limit_s(conditions.STUCK_AT_EDGE, cfg.health)
+        row = conditions.STUCK_AT_EDGE
+        self.stuck_limit_s = limit_s(find_condition(row.name) or row, cfg.health)
         self._budget: TimeBudget | None = None
         if cfg.mission.holds_to_budget:
             self._budget = TimeBudget(cfg.run.budget_s, mirror, cfg.limits, cfg.etalon.measuring_time_s)
@@ -191,7 +192,7 @@ class Survey(EngagementRules[SurveyState]):
         mission, backoffs = self.cfg.mission, s.backoffs + 1
         if backoffs > mission.max_backoffs_per_stop:
             cause = conditions.BACK_OFFS.cause(count=mission.max_backoffs_per_stop)
-            return self.fault(replace(s, backoffs=0), cause)
+            return self.meet(replace(s, backoffs=0), cause)
         s = replace(
             s,
             backoffs=backoffs,
@@ -250,7 +251,7 @@ class Survey(EngagementRules[SurveyState]):
     def _without_way(self, s: SurveyState, cause: Cause) -> SurveyState:
         """No way leads on: the estimate may be wrong, so a fix comes before giving up."""
         if s.is_confirmed:
-            return self.fault(replace(s, is_confirmed=False), cause)
+            return self.meet(replace(s, is_confirmed=False), cause)
         return self._find(replace(s, is_confirmed=True))
 
     def _follow(self, s: SurveyState, motion: StateEstimate, stop: Stop) -> tuple[SurveyState, MissionCommand | None]:
@@ -282,7 +283,7 @@ class Survey(EngagementRules[SurveyState]):
         return is_long and (follower.is_at_rim(leg.stop) or follower.distance_m(leg.stop, motion.pose) > reach_m)
 
     def _overdue(self, s: SurveyState, stop: Stop) -> SurveyState:
-        return self.fault(s, conditions.LEG_OVERDUE.cause(x_m=stop.x_m, y_m=stop.y_m))
+        return self.meet(s, conditions.LEG_OVERDUE.cause(x_m=stop.x_m, y_m=stop.y_m))
 
     def _arrive(self, s: SurveyState, motion: StateEstimate) -> Step:
         settling = Settling()
@@ -345,8 +346,8 @@ class Survey(EngagementRules[SurveyState]):
         going_on = budget.review(progress, motion.t_s, deck, left)
         s = replace(s, budget=progress)
         if going_on is None:
-            cause = s.abort_cause or conditions.TIME_USED_UP.cause(budget_s=budget.budget_s)
-            return self.proceed(replace(s, abort_cause=cause)), False
+            s = self.meet(s, conditions.TIME_USED_UP.cause(budget_s=budget.budget_s))
+            return s, isinstance(s.phase, Travel)
         if going_on is left:
             return s, True
         dropped = set(left).difference(going_on)
@@ -374,7 +375,7 @@ class Survey(EngagementRules[SurveyState]):
 
     def _check_rest(self, s: SurveyState, standing: Settling | Measuring, motion: StateEstimate) -> SurveyState:
         if standing.rest_by_s is not None and motion.t_s > standing.rest_by_s:
-            return self.fault(s, conditions.NO_REST.cause(v_m_s=motion.speed_m_s, omega_rad_s=motion.rate_rad_s))
+            return self.meet(s, conditions.NO_REST.cause(v_m_s=motion.speed_m_s, omega_rad_s=motion.rate_rad_s))
         return replace(s, phase=standing)
 
     # -- edge and home ------------------------------------------------------------------------------------------------
@@ -386,7 +387,7 @@ class Survey(EngagementRules[SurveyState]):
         if retreat.step is RetreatStep.OVER or (retreat.step is RetreatStep.TURN_AWAY and s.abort_cause):
             return enter(s, Event.GO_ON, Settling()), HOLD_POSITION
         if retreat.step is RetreatStep.STUCK:
-            return self.interrupt(s, conditions.STUCK_AT_EDGE.cause(), stuck_s=motion.t_s), HOLD_POSITION
+            return self.meet(s, conditions.STUCK_AT_EDGE.cause(), stuck_s=motion.t_s), HOLD_POSITION
         return replace(s, phase=retreat), MissionCommand(twist)
 
     def _return(self, s: SurveyState, way: ReturnHome | None, motion: StateEstimate) -> Step:
@@ -463,10 +464,12 @@ class Survey(EngagementRules[SurveyState]):
         if times_s and t_s - times_s[-1] <= health.pause_limit_s:
             times_s.pop()  # still the same divergence, which is reported in every frame
         s = replace(s, recoveries_s=(*times_s, t_s))
-        if len(s.recoveries_s) > 1 + health.retries:
+        row = find_condition(cause.condition)
+        retries = health.retries if row is None or row.retries is None else row.retries
+        if len(s.recoveries_s) > 1 + retries:
             return self.fault(s, cause, loses_pose=True)
         # A frozen filter does not show when the robot stands, so the hold lasts for a fixed time.
-        return self.await_recovery(s, cause, until_s=t_s + health.retry_after_s)
+        return self.meet(s, cause, usual=Clear.AFTER_FIX, until_s=t_s + health.retry_after_s)
 
     def _fixed(self, s: SurveyState, event: FixStored) -> SurveyState:
         s, point = replace(s, failures=0), event.point
@@ -491,13 +494,13 @@ class Survey(EngagementRules[SurveyState]):
         s = replace(s, failures=0 if failures >= limit else failures)
         if point is None:
             if failures >= limit:
-                return self.fault(s, conditions.NOT_FOUND.cause(why=cause))
+                return self.meet(s, conditions.NOT_FOUND.cause(why=cause))
             if isinstance(s.phase, Measuring):  # this fix is needed; the robot may not have stood quite still
                 s = replace(s, phase=replace(s.phase, is_requested=False, is_repeated=True))
             return s
         s = replace(s, failure_causes={**s.failure_causes, point: cause}, due=_without(s.due, point))
         if failures >= limit:
-            s = self.fault(s, conditions.MEASUREMENTS_FAILED.cause(count=limit, why=cause))
+            s = self.meet(s, conditions.MEASUREMENTS_FAILED.cause(count=limit, why=cause))
         return self._leave_stop(s, point, sigma_rad, is_measured=False)
 
     def _leave_pointless(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:

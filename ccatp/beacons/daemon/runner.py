@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
-from math import cos, inf, sin
+from math import cos, sin
 
 from ccatp.beacons.conditions import FRAMES_MISSED
 from ccatp.beacons.config.models import RadioConfig
@@ -37,12 +37,12 @@ ECHO_MEMORY = 200  # number of recent echoes of the distance sensors, for displa
 TRAIL = 400  # number of places of the robot, one in five frames
 CLOCK_JUMP_FRAMES = 10.0
 # The robot cannot relocalize: a pause becomes a fault without a hold before.
-PAUSE_S, HOLD_S = inf, 30.0
+HOLD_S = 30.0
 
 
 def loop_limits(cfg: RadioConfig) -> LoopLimits:
     """Limits of the main loop."""
-    return LoopLimits(CLOCK_JUMP_FRAMES * cfg.run.step_s, PAUSE_S, HOLD_S)
+    return LoopLimits(CLOCK_JUMP_FRAMES * cfg.run.step_s, HOLD_S)
 
 
 class BeaconRunner(MissionRunner):

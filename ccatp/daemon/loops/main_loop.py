@@ -84,7 +84,7 @@ class MainLoop:
         self._alarms = AlarmWatch(context, danger, AlarmList(args.run_dir, self.log))
         self._runner = runner = make_runner(self)
         self._telemetry = runner.telemetry
-        self._pauses = PauseWatch(runner, limits)
+        self._pauses = PauseWatch(runner, limits, cfg)
         self._standstill = StandstillWatch(runner, self.heartbeat, self._alarms.alarms, cfg.robot)
         self._drives = DriveSender(self.session, runner.on_drive)
         self._lockstep = LockstepTime(runner, self._drives)

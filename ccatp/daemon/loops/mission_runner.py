@@ -9,7 +9,6 @@ mission has a subclass of ``MissionRunner``, which its ``ccatp.missions.MissionK
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from math import inf
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
@@ -62,17 +61,16 @@ STILL = DriveCommand(0.0, 0.0)
 class LoopLimits(NamedTuple):
     """Limits of the main loop, s: steps of the robot's clock beyond the first are left out of the mission's time.
 
-    A pause that the main loop finds itself needs a fix after ``pause_s`` and is a fault after ``hold_s``.
+    A pause that the main loop finds itself is a fault after ``hold_s``, if its row does not make it one before.
     """
 
     clock_jump_s: float
-    pause_s: float
     hold_s: float
 
 
 def usual_limits(_cfg: object) -> LoopLimits:
-    """Limits for a robot that cannot relocalize: a pause becomes a fault without a fix before."""
-    return LoopLimits(clock_jump_s=0.1, pause_s=inf, hold_s=30.0)
+    """Limits for a robot that cannot relocalize: its configuration has no limit after which a pause needs a fix."""
+    return LoopLimits(clock_jump_s=0.1, hold_s=30.0)
 
 
 class MissionHost(Protocol):

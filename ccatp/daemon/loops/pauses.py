@@ -3,8 +3,9 @@
 from msgspec.structs import replace
 
 from ccatp.conditions import Condition, Owner, find_condition, text_of
+from ccatp.core import Severity
 from ccatp.daemon.loops.mission_runner import LoopLimits, MissionRunner
-from ccatp.safety.escalation import Since
+from ccatp.safety.escalation import Since, find_limit_s
 from ccatp.survey.engagement import Engagement
 from ccatp.survey.events import HELD, Fault, Interrupted
 
@@ -12,8 +13,9 @@ from ccatp.survey.events import HELD, Fault, Interrupted
 class PauseWatch:
     """Pauses a mission, and escalates a pause that lasts."""
 
-    def __init__(self, runner: MissionRunner, limits: LoopLimits) -> None:
+    def __init__(self, runner: MissionRunner, limits: LoopLimits, cfg: object) -> None:
         self._runner = runner
+        self._cfg = cfg
         self._limits = limits
         self._paused = Since()
         self._has_gap = False
@@ -26,7 +28,7 @@ class PauseWatch:
         return mission.state is not before
 
     def escalate(self, now_s: float, *, counts: bool) -> None:
-        """After its first limit a pause needs a fix before the robot moves; after its second one it is a fault.
+        """After the limit of its row a pause is what the row says; a hold needs a fix, and becomes a fault as well.
 
         ``counts``: the time counts; not in lockstep, whose time stands still meanwhile.
         """
@@ -36,11 +38,16 @@ class PauseWatch:
         waits = row is not None and row.escalates_to is not None and not state.is_held_by_hand
         lasts_s = self._paused.lasts(now_s, waits and counts)
         self._has_gap = self._has_gap and lasts_s >= 0.0
-        if lasts_s >= self._limits.pause_s and not self._has_gap:
+        if row is None or lasts_s < 0.0:
+            return
+        limit_s = find_limit_s(row, self._cfg)
+        is_fault = row.raised_severity is Severity.FAULT
+        if lasts_s >= limit_s and not (is_fault or self._has_gap):
             self._has_gap = True
             self._runner.on_tracking_gap()
-        if lasts_s >= self._limits.hold_s:
-            cause = replace(state.cause, lasted_s=self._limits.hold_s)
+        fault_s = limit_s if is_fault else self._limits.hold_s
+        if lasts_s >= fault_s:
+            cause = replace(state.cause, lasted_s=fault_s)
             mission.handle(Fault(cause))
             self._runner.telemetry.notify_operator("error", text_of(cause))
 

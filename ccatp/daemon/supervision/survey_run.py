@@ -39,7 +39,7 @@ def _progress(status: MissionStatus) -> str:
 def loop_limits(cfg: Config) -> LoopLimits:
     """Limits of the main loop."""
     health = cfg.health
-    return LoopLimits(health.clock_jump_s, health.pause_limit_s, health.hold_limit_s)
+    return LoopLimits(health.clock_jump_s, health.hold_limit_s)
 
 
 def check_survey(options: RunOptions, cfg: Config) -> None:

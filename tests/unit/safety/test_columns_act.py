@@ -2,26 +2,34 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from ccatp.beacons.conditions import GROUP as BEACONS
+from ccatp.beacons.mission import BeaconRules
+from ccatp.beacons.modes import VISITING, Working
 from ccatp.conditions import (
     TABLE,
     Action,
     Clear,
     Condition,
     Motion,
+    Owner,
 )
+from ccatp.conditions.mission import NO_VERDICT, STUCK_AT_EDGE
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
+from ccatp.daemon.loops.mission_runner import LoopLimits, MissionRunner
+from ccatp.daemon.loops.pauses import PauseWatch
 from ccatp.daemon.operator.alarms import active_cause
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety import edge_episode, emergency_latch
 from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
-from ccatp.survey.events import Mode
+from ccatp.survey.engagement import EngagedMission, Engagement
+from ccatp.survey.events import EstimateDiverged, Fault, Interrupted, Mode
 from ccatp.survey.state import SurveyState
 from tests.support.mission_story import Story
 from tests.support.rows import DANGER, OTHERS
@@ -206,3 +214,96 @@ def test_motion_and_action_of_an_emergency_give_permits_and_code(
     after = latch.verdict(1, 0.0)
     assert after is not None
     assert (after.forward, after.code) == (not before.forward, EventCode.NEAR_EDGE)
+
+
+# -- what a mission, its localizer, its fixes, its link or the main loop finds -----------------------------------------
+
+# Commands of an operator act whatever their row says; the fix service waits for the lasers, and reports lengths.
+NOT_MET = {"operator", "restarted", "laser_not_ready", "metrology_unreliable"}
+MET = [row for row in OTHERS if row.name not in NOT_MET]
+
+
+# A mission that finds a fault itself knows where it is.
+OWN_ENDS = ENDS | {Clear.OPERATOR: (True, False)}
+
+
+def met(row: Condition, config: Config, mirror: Mirror) -> tuple[SurveyState, SurveyState]:
+    """The state of a driving survey, and the one after its own finding, as the owner of the row reports it."""
+    story = Story(config, mirror)
+    story.until_state(Mode.DRIVING)
+    before, cause = story.state, row.cause()
+    match row.owner:
+        case Owner.FIXES:
+            story.mission.handle(Fault(cause))
+        case Owner.LOCALIZER:
+            story.mission.handle(EstimateDiverged(cause, story.t))
+        case Owner.LINK | Owner.MAIN:
+            story.mission.handle(Interrupted(cause))
+        case _:
+            return before, story.mission.survey.meet(before, cause)
+    return before, story.state
+
+
+@named(MET)
+def test_motion_and_clear_of_an_own_finding_decide_the_hold(row: Condition, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, mirror = config_of("fyst-m2"), mirror_of("fyst-m2")
+    if row.motion is Motion.NONE:
+        assert what_ends(met(row, config, mirror)[1]) == OWN_ENDS[row.clear or Clear.AUTO]
+    for clear, ends in OWN_ENDS.items():
+        monkeypatch.setitem(TABLE, row.name, replace(row, motion=Motion.NONE, clear=clear))
+        assert what_ends(met(row, config, mirror)[1]) == ends, clear
+    monkeypatch.setitem(TABLE, row.name, replace(row, motion=Motion.ANY))
+    before, after = met(row, config, mirror)
+    assert after.phase == before.phase  # it is only reported
+    monkeypatch.setitem(TABLE, row.name, replace(row, motion=Motion.RETURN))
+    assert met(row, config, mirror)[1].mode is Mode.RETURNING
+
+
+def test_clear_of_no_verdict_decides_the_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    config, mirror = config_of("fyst-m2"), mirror_of("fyst-m2")
+    for clear, ends in OWN_ENDS.items():
+        monkeypatch.setitem(TABLE, NO_VERDICT.name, replace(NO_VERDICT, clear=clear))
+        story = Story(config, mirror)
+        story.until_state(Mode.DRIVING)
+        story.frame(None)
+        assert what_ends(story.state) == ends
+
+
+def test_limit_of_a_retreat_that_leads_nowhere_is_when_it_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    config, mirror = config_of("fyst-m2", health__hold_limit_s=7.0, health__lifted_limit_s=5.0), mirror_of("fyst-m2")
+    for name, limit_s in (("health.hold_limit_s", 7.0), ("health.lifted_limit_s", 5.0)):
+        monkeypatch.setitem(TABLE, STUCK_AT_EDGE.name, replace(STUCK_AT_EDGE, limit=name))
+        assert Story(config, mirror).mission.survey.stuck_limit_s == limit_s
+
+
+def escalated_pause(row: Condition, config: Config) -> list[tuple[str, int]]:
+    """What becomes of a pause that only the main loop finds, each with the second in which it does."""
+    seen: list[tuple[str, int]] = []
+    mission = EngagedMission(BeaconRules(), Engagement(Working(VISITING)))
+    now_s = 0
+    runner = SimpleNamespace(
+        mission=mission,
+        on_tracking_gap=lambda: seen.append(("fix", now_s)),
+        telemetry=SimpleNamespace(notify_operator=lambda *_: seen.append(("fault", now_s))),
+    )
+    watch = PauseWatch(cast(MissionRunner, runner), LoopLimits(clock_jump_s=0.1, hold_s=7.0), config)
+    watch.interrupt(row)
+    for now_s in range(20):
+        watch.escalate(float(now_s), counts=True)
+    return seen
+
+
+@named([row for row in MET if row.owner is Owner.MAIN])
+def test_limit_and_escalates_to_of_a_pause_of_the_main_loop(row: Condition, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = config_of("fyst-m2", health__pause_limit_s=3.0, health__hold_limit_s=7.0, health__lifted_limit_s=5.0)
+    monkeypatch.setitem(TABLE, row.name, replace(row, limit="health.lifted_limit_s", escalates_to=Action.HOLD))
+    assert escalated_pause(row, config) == [("fix", 5), ("fault", 7)]
+    monkeypatch.setitem(TABLE, row.name, replace(row, limit="health.pause_limit_s", escalates_to=Action.HOLD))
+    assert escalated_pause(row, config) == [("fix", 3), ("fault", 7)]
+    monkeypatch.setitem(TABLE, row.name, replace(row, limit="health.pause_limit_s", escalates_to=Action.FAULT))
+    assert escalated_pause(row, config) == [("fault", 3)]
+    monkeypatch.setitem(TABLE, row.name, replace(row, escalates_to=None))
+    assert escalated_pause(row, config) == []
+    # A configuration without that key is of a robot that cannot relocalize.
+    monkeypatch.setitem(TABLE, row.name, replace(row, limit="health.pause_limit_s", escalates_to=Action.HOLD))
+    assert escalated_pause(row, cast(Config, SimpleNamespace())) == [("fault", 7)]
