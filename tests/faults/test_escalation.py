@@ -36,7 +36,7 @@ FINDINGS = st.lists(st.builds(finding, st.sampled_from(list(Severity)[1:]), st.s
 
 
 @given(FINDINGS)
-def test_the_gravest_wins_and_any_hold_denies(findings: list[MonitorFinding]) -> None:
+def test_the_highest_severity_counts_and_any_hold_denies(findings: list[MonitorFinding]) -> None:
     top = gravest(findings)
     assert (top is None) == (not findings)
     if top is not None:
@@ -46,7 +46,7 @@ def test_the_gravest_wins_and_any_hold_denies(findings: list[MonitorFinding]) ->
 
 
 @given(st.lists(st.tuples(st.floats(0.01, 5.0), FINDINGS), max_size=20))
-def test_the_ladder_only_ever_raises(steps: list[tuple[float, list[MonitorFinding]]]) -> None:
+def test_escalation_only_raises_the_severity(steps: list[tuple[float, list[MonitorFinding]]]) -> None:
     ladder, t_s = SeverityEscalation(HEALTH), 0.0
     for dt_s, findings in steps:
         t_s += dt_s
@@ -65,7 +65,7 @@ def test_a_pause_becomes_a_hold_and_a_hold_a_fault() -> None:
 
 
 @pytest.mark.parametrize(("gap_s", "last"), [(10.0, Severity.FAULT), (45.0, Severity.HOLD)])
-def test_what_comes_again_and_again_is_a_fault(gap_s: float, last: Severity) -> None:
+def test_a_hold_that_repeats_becomes_a_fault(gap_s: float, last: Severity) -> None:
     ladder = SeverityEscalation(HEALTH)
     found = []
     for k in range(HEALTH.retries + 2):

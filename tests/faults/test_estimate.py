@@ -202,7 +202,7 @@ class Burning(RestartedSurvey):
 
 @pytest.mark.fault("O1", "P1")
 @pytest.mark.parametrize("is_before", [True, False])
-def test_whoever_takes_over_in_a_fire_finds_the_heading_and_goes_home(is_before: bool) -> None:
+def test_a_main_loop_that_takes_over_in_a_fire_finds_the_heading_and_goes_home(is_before: bool) -> None:
     run = Burning(restarted(1, mission__calibration_length_m=0.0), is_before=is_before)
     result = run.run()
     assert (run.states == [Mode.RETURNING]) is is_before

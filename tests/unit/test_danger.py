@@ -247,7 +247,7 @@ def test_an_edge_that_a_fix_shows_to_be_a_seam_was_none(at_seam: Story) -> None:
 # -- (d) turns --------------------------------------------------------------------------------------------------------
 
 
-def test_an_edge_met_in_turning_may_be_turned_back(on_panel: Story) -> None:
+def test_at_an_edge_found_in_a_turn_the_turn_back_is_permitted(on_panel: Story) -> None:
     on_panel.run(7, omega=0.5, off=FL)  # 4.4 mm of arc
     verdict = on_panel.run(6, omega=0.1, off=FL)  # slowly, so that the declaration is fresh
     assert verdict.code is EventCode.NEAR_EDGE
@@ -518,7 +518,7 @@ def test_a_stale_estimate_holds_an_aborted_robot_too(on_panel: Story) -> None:
     assert permits(verdict) == NO_PERMIT
 
 
-def test_mains_state_tells_whether_an_emergency_may_be_cleared(on_panel: Story) -> None:
+def test_the_state_of_main_decides_whether_an_emergency_may_be_cleared(on_panel: Story) -> None:
     on_panel.run(1)
     assert not on_panel.monitor.at_base_or_held
     on_panel.state = "held"
@@ -529,7 +529,7 @@ def test_mains_state_tells_whether_an_emergency_may_be_cleared(on_panel: Story) 
     assert not on_panel.monitor.at_base_or_held
 
 
-def test_what_main_said_before_an_emergency_does_not_clear_it(on_panel: Story) -> None:
+def test_a_state_sent_before_an_emergency_does_not_clear_it(on_panel: Story) -> None:
     on_panel.state = "held"
     on_panel.run(5)
     assert on_panel.monitor.emergency("fire", "a") is None
@@ -601,7 +601,7 @@ def test_odometry_interpolates_and_then_holds_the_velocity() -> None:
     assert (odometry.y_m, odometry.heading_rad) == (0.0, 0.0)
 
 
-def test_a_track_reads_each_wheel_on_its_own_and_forgets_the_distant_past() -> None:
+def test_a_track_reads_each_wheel_by_itself_and_drops_old_samples() -> None:
     track = WheelTrack(0.03, 0.15, 0.15, 0.3)
     track.push([WheelSample(0.0, 1.0, None), WheelSample(0.001, None, 1.0), WheelSample(0.0005, 9.0, None)])
     track.update(0.001)
@@ -622,7 +622,7 @@ class Samples(list[WheelSample]):
     """Of a frame; shows when nothing refers to it any more."""
 
 
-def test_a_track_lets_go_of_frames_that_it_will_not_read() -> None:
+def test_a_track_drops_frames_that_it_will_not_read() -> None:
     track = WheelTrack(0.03, 0.15, 0.15, 0.25)
     frames: list[ReferenceType[Samples]] = []
     for k in range(64):
@@ -635,7 +635,7 @@ def test_a_track_lets_go_of_frames_that_it_will_not_read() -> None:
     assert [knot.t_s for knot in track.knots] == [7.625, 7.75, 7.875]
 
 
-def test_odometry_survives_the_tracks_forgetting() -> None:
+def test_odometry_continues_after_the_track_dropped_knots() -> None:
     track = WheelTrack(0.03, 0.15, 0.15, 0.3)
     track.push([WheelSample(0.0, 1.0, 1.0)])
     track.update(0.0)

@@ -47,7 +47,7 @@ def test_the_caster_takes_load_and_downhill_behind_takes_most() -> None:
     assert GripModel(cfg).least_thrust_n(gravity(pi), turns=False) == pytest.approx(outward + along * 0.035 / 0.015)
 
 
-def test_on_a_floor_none_is_needed() -> None:
+def test_on_a_floor_no_thrust_is_needed() -> None:
     assert GripModel(robot()).least_thrust_n((0.0, 0.0, -1.0), turns=True) == 0.0
 
 
@@ -93,7 +93,7 @@ def test_duty_goes_to_what_a_turn_needs_with_a_ramp(mirror: str, thrust_n: float
     ("thrust_n", "is_held", "is_short", "text"),
     [(40.0, True, False, "give 40.0 N"), (31.0, True, True, "half the speed"), (20.0, False, True, "WOULD SLIDE")],
 )
-def test_what_the_plan_says_of_a_slope(thrust_n: float, is_held: bool, is_short: bool, text: str) -> None:
+def test_the_forecast_describes_the_grip_on_a_slope(thrust_n: float, is_held: bool, is_short: bool, text: str) -> None:
     cfg = load_config(overrides={"run.mirror": "fyst-m2", "robot.thrust_n": thrust_n})
     grip = GripModel(cfg.robot).forecast(build_mirror(cfg.mirror))
     assert (grip.is_held, grip.is_short) == (is_held, is_short)

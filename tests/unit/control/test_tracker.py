@@ -199,7 +199,7 @@ def test_against_a_drift_it_turns_off_the_bearing(tracker: Leg) -> None:
     assert tracker.step((0.0, 0.0, 0.0), (0.5, 0.0), DT, Twist(0.0, 0.0), DRIFT).omega_rad_s > 0.0
 
 
-def test_steering_damps_a_rate_that_it_did_not_want(tracker: Leg, config: Config) -> None:
+def test_steering_damps_an_unwanted_rate(tracker: Leg, config: Config) -> None:
     rates = []
     for omega in (0.0, 0.1):
         tracker.begin((0.0, 0.0, 0.0), (0.5, 0.0), False)
@@ -207,7 +207,7 @@ def test_steering_damps_a_rate_that_it_did_not_want(tracker: Leg, config: Config
     assert rates[1] - rates[0] == pytest.approx(-0.1 * config.control.gain_sets["shipped"].angular.kd)
 
 
-def test_a_turn_does_not_chase_the_bearing_of_a_stop_at_its_feet(config: Config) -> None:
+def test_a_turn_ends_although_the_bearing_of_a_near_stop_changes(config: Config) -> None:
     # The turn carries the robot round the stop, which is always a radian further.
     stop, near_m, rig = (0.3, 0.4), 0.002, Rig(config)
 

@@ -112,7 +112,7 @@ def test_it_learns_the_share_that_is_lost(axis: KeptAxis) -> None:
     assert driven(axis, 0.95) == pytest.approx(V_MAX / 0.95, rel=0.015)
 
 
-def test_the_end_counts_what_the_wheels_still_run(axis: KeptAxis) -> None:
+def test_the_end_includes_the_travel_while_the_wheels_run_down(axis: KeptAxis) -> None:
     axis.begin(0.0)
     assert axis.is_over(0.0008, 0.0002, 0.01)  # 10 mm/s for 80 ms
     assert not axis.is_over(0.0, 0.0002, 0.01)
@@ -228,7 +228,7 @@ def test_held_wheels_run_down_whatever_was_sent(predictor: Sender) -> None:
     )
 
 
-def test_a_restart_forgets_what_was_sent(predictor: Sender) -> None:
+def test_a_new_session_drops_the_sent_drives(predictor: Sender) -> None:
     predictor.add(1, 0.0, 0.0)
     assert predictor.ahead(POSE, 0.0, 0.0, -1, DT_PREDICTION, False) == Predicted(POSE, 0.0, 0.0)
     predictor.add(2, 0.1, 0.0)

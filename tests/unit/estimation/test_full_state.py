@@ -81,7 +81,7 @@ def test_fixes_of_a_panel_share_its_tilt() -> None:
     assert found.position_sigma_m == pytest.approx(1e-4, rel=0.2)  # the tilt itself cannot be told from the place
 
 
-def test_one_wild_fix_is_gated(filter_name: str) -> None:
+def test_a_single_wrong_fix_is_refused(filter_name: str) -> None:
     found = build(filter_name)
     robot = rested(found)
     before = found.pose, found.state[0].copy(), found.state[1].copy()
@@ -96,7 +96,7 @@ def test_one_wild_fix_is_gated(filter_name: str) -> None:
 
 
 @pytest.mark.parametrize("off_sigmas", [6.5, 7.5])
-def test_where_the_gate_is(off_sigmas: float) -> None:
+def test_a_fix_is_refused_beyond_the_limit_of_the_gate(off_sigmas: float) -> None:
     """Seven sigmas: their square is a NIS of 50."""
     found = build()
     robot = rested(found)
@@ -114,7 +114,7 @@ OFF = (0.03, -0.02)
 NEARLY = [OFF, (0.031, -0.02), (0.03, -0.021)]
 
 
-def test_three_fixes_that_agree_are_right(filter_name: str, full: Any) -> None:
+def test_three_fixes_that_agree_relocate_the_robot(filter_name: str, full: Any) -> None:
     found = build(filter_name)
     robot = rested(found)
     heading, variance = found.deck_pose.heading_rad, float(found.state[1][PSI, PSI])
@@ -138,7 +138,7 @@ def begin_anew(found: FullStateLocalizer, robot: Robot, off_m: tuple[float, floa
     found.fuse_fix(robot.fix(off_m=off_m))
 
 
-def test_a_leg_that_ended_elsewhere_puts_the_heading_in_doubt() -> None:
+def test_a_leg_that_ended_elsewhere_makes_the_heading_uncertain() -> None:
     found = build()
     robot = rested(found)
     start = found.deck_pose
@@ -158,7 +158,7 @@ def begin_leg(found: FullStateLocalizer, robot: Robot) -> tuple[FloatArray, Floa
 
 
 @pytest.mark.parametrize("slip_per_leg", [True, False])
-def test_what_odometry_did_before_it_was_doubted_teaches_the_pose_alone(filter_name: str, slip_per_leg: bool) -> None:
+def test_after_odometry_was_wrong_a_fix_corrects_only_the_pose(filter_name: str, slip_per_leg: bool) -> None:
     """An encoder is stuck for a part of the leg; the doubt comes when the robot stands, or while it drives."""
     for doubted_after_s in (1.0, 1.9):
         found = build(filter_name, use={"slip_per_leg": slip_per_leg})
@@ -180,7 +180,7 @@ def test_what_odometry_did_before_it_was_doubted_teaches_the_pose_alone(filter_n
         np.testing.assert_allclose(S[block], P[block], rtol=1e-6, atol=1e-12)
 
 
-def test_who_begins_anew_twice_in_a_row_forgets_what_was_learned() -> None:
+def test_a_second_relocation_in_a_row_resets_what_was_learned() -> None:
     found = build()
     robot = rested(found)
     learned = begin_leg(found, robot)[1][BG, BG]
@@ -226,7 +226,9 @@ def test_a_fix_that_reports_nothing_is_refused(change: dict[str, Any], match: st
         ([OFF, OFF, (-0.05, 0.0), OFF, OFF, OFF], 1),  # a wild one in between begins it anew
     ],
 )
-def test_only_three_in_a_row_that_agree_are_right(offs: list[tuple[float, float] | None], reinitialised: int) -> None:
+def test_only_three_consecutive_fixes_that_agree_relocate_the_robot(
+    offs: list[tuple[float, float] | None], reinitialised: int
+) -> None:
     found = build()
     robot = rested(found)
     gated = 0
@@ -375,7 +377,7 @@ def test_ekf_and_ukf_agree(wrong: Errors, turn_creep_sigma_m_rad: float, limit: 
         assert abs(heading_rad) < 4.0 * localizer.heading_sigma_rad
 
 
-def test_between_the_steps_of_the_filter_the_pose_is_carried_on() -> None:
+def test_between_steps_of_the_filter_the_pose_advances_by_dead_reckoning() -> None:
     """An all but perfect robot, known to be one: each frame's pose, whether the filter has stepped or not."""
     robot = Robot(
         v=L_SHAPED[0], omega=L_SHAPED[1], errors=Errors(noise=1e-3)

@@ -178,7 +178,7 @@ def test_zeros_at_rest_show_a_counter() -> None:
     assert wheel.noise_rad2_s2 == 0.0
 
 
-def test_noise_shows_that_it_is_none() -> None:
+def test_noise_shows_that_an_encoder_is_no_counter() -> None:
     wheel, rng = WheelAngle(), np.random.default_rng(1)
     for k in range(200):
         times = [0.01 * k + DT_S * i for i in range(1, 11)]
@@ -196,7 +196,7 @@ paths = st.lists(st.tuples(st.floats(0.0, 3.0), st.floats(-6.0, 6.0)), min_size=
 
 @settings(max_examples=50, deadline=None)
 @given(paths, st.integers(1, 13), st.floats(0.0, 1000.0))
-def test_counts_telescope(pieces: list[tuple[float, float]], per_frame: int, t0_s: float) -> None:
+def test_counts_add_up(pieces: list[tuple[float, float]], per_frame: int, t0_s: float) -> None:
     """However it is driven, forward and back: the sum is never off by more than a count."""
     angles, angle = [0.1], 0.1
     for phase, rate in pieces:

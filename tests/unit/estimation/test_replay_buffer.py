@@ -246,7 +246,7 @@ def fragile() -> tuple[FullStateLocalizer, Fragile]:
     return build(wrap=lambda _: filter_), filter_
 
 
-def test_a_revived_filter_stays_alive() -> None:
+def test_a_filter_that_starts_again_stays_finite() -> None:
     """The wheels went on while the filter stood; that way is not taken for one of the first block."""
     found, filter_ = fragile()
     robot = Robot(v=STRAIGHT, errors=NOISY)
@@ -297,7 +297,7 @@ def test_silent_encoders_are_no_rest() -> None:
 
 
 @pytest.mark.parametrize("within", [0, 3])
-def test_a_new_beginning_while_it_drives(within: int) -> None:
+def test_a_relocation_while_the_robot_drives(within: int) -> None:
     """The third of three fixes that agree, of some frames ago: the robot has gone on, and the wheels tell how fast."""
     story = Story("straight on")
     end = story.end_after(1.8)
@@ -318,7 +318,7 @@ def test_a_new_beginning_while_it_drives(within: int) -> None:
     assert found.deck_pose.x_m - here.x_m - 0.06 == pytest.approx((1e-3 * within + 0.06) * cos(0.3), abs=3e-3)
 
 
-def test_what_is_done_again_does_not_count_again() -> None:
+def test_repeated_steps_are_not_counted_again() -> None:
     start = before_a_seam(0, True)
     robot, found = Robot(start, v=across_it(), has_edges=True), build(start=start, rewind_s=5.0)
     frames = robot.frames(1.4)

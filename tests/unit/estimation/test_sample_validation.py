@@ -82,7 +82,7 @@ def test_unusable_samples_of_the_inertial_unit(reason: str) -> None:
     assert counts(found) == {reason: 1}
 
 
-def test_a_jump_of_the_clock_forgets_all_times() -> None:
+def test_a_jump_of_the_clock_drops_all_times() -> None:
     found = intake()
     found.restart()
     assert found.wheels(0.01, [WheelSample(0.005, 1.0, 2.0)]) == (((0.005,), (1.0,)), ((0.005,), (2.0,)))

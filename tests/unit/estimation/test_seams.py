@@ -145,7 +145,7 @@ def test_the_two_edges_of_a_gap_have_an_offset_each(seams: SeamLines) -> None:
     assert reached.position_m - left.position_m == pytest.approx(edges_of(0)[1] - edges_of(0)[0])
 
 
-def test_another_seam_or_a_pose_found_anew_begins_with_an_unknown_offset(seams: SeamLines) -> None:
+def test_another_seam_or_a_relocation_starts_with_an_unknown_offset(seams: SeamLines) -> None:
     other = Meeting(1, True, False, 0, 0.0, 0.1, 0.0, 0.0)
     changes: tuple[Callable[[], object], ...] = (partial(other.meet, seams), seams.forget)
     for change in changes:
@@ -208,7 +208,7 @@ def test_a_seam_places_the_robot(k: int, is_up: bool, forward: float, full: Full
     assert P[Y - k, Y - k] > 1e-6
 
 
-def test_what_the_map_does_not_know_goes_to_the_offsets() -> None:
+def test_errors_of_the_map_go_to_the_offsets() -> None:
     """The edges lie 0.4 mm from the map: the pose is off by that, but the heading is not."""
     robot = Robot(before_a_seam(0, True), across_it(), has_edges=True, shift_m=(4e-4, 0.0))
     found = build(
@@ -329,7 +329,7 @@ def update(x: FloatArray, P: FloatArray, row: FloatArray, z: float, noise: float
     return x + K * (z - row @ x), P - np.outer(K, row @ P)
 
 
-def test_the_next_leg_is_given_what_bayes_gives_it(full: FullStateConfig) -> None:
+def test_the_prior_of_the_next_leg_is_that_of_bayes(full: FullStateConfig) -> None:
     """Over four legs; creep, which scatters by a share of itself, only while that has not been learned."""
     book = SlipPrior(full)
     x, P = state(*book.first())

@@ -255,7 +255,7 @@ def test_a_late_fix_belongs_to_its_own_time() -> None:
     assert errors(localizer, world.pose)[0] < 5e-5
 
 
-def test_odometer_keeps_the_standstill_and_forgets_the_rest() -> None:
+def test_the_odometer_keeps_a_standstill_and_drops_older_steps() -> None:
     odometer = Odometer(0.2)
     assert odometer.oldest_s == inf
     assert odometer.at(1.0) == OdometryPose(0.0, 0.0, 0.0)
@@ -313,7 +313,7 @@ def test_an_impossible_speed_freezes_instead_of_moving(left: float) -> None:
 
 @pytest.mark.fault("S4")
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
-def test_what_is_not_finite_never_reaches_the_filter(bad: float) -> None:
+def test_values_that_are_not_finite_never_reach_the_filter(bad: float) -> None:
     clean, bad_wheels, bad_imu = make(), make(), make()
     world = truth(v=lambda _: 0.05, noise=1.0)
     for frame in world.frames(0.3):

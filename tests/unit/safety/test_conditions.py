@@ -351,7 +351,7 @@ def test_only_conditions_that_are_reported_alone_have_equal_precedence() -> None
     assert all(row.precedence != ALONE for row in DANGER)
 
 
-def test_of_two_the_graver_wins_and_of_equal_ones_the_lowest_number() -> None:
+def test_of_two_the_more_severe_counts_and_of_equal_ones_the_lowest_number() -> None:
     for first, second in combinations(DANGER, 2):
         found = first.found("a", 1.0, 0.0), second.found("b", 1.0, 0.0)
         winner = min(found, key=lambda one: (-one.severity, one.condition.precedence))

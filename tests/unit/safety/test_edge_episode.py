@@ -168,7 +168,7 @@ def test_the_map_is_asked_at_the_sensors_place_along_its_way(heading: float, tur
     assert axis is None
 
 
-def test_unheard_wheels_count_as_the_fastest() -> None:
+def test_silent_wheels_count_as_the_fastest() -> None:
     limit = DANGER.no_map_travel_m
     sensor = Sensor(Map(seams=("x",)))
     assert not sensor.off(0.0, worst_m=limit)
@@ -278,7 +278,7 @@ WAYS = [
 
 
 @pytest.mark.parametrize("case", WAYS)
-def test_which_way_off_the_panel_is_an_edge(case: Ways) -> None:
+def test_a_path_off_the_panel_is_an_edge_beyond_its_limit(case: Ways) -> None:
     sensor = Sensor(case.map, **case.sensor)
     *before, last = case.ways
     assert not any(sensor.walk(*way) for way in before)
@@ -290,7 +290,7 @@ def test_which_way_off_the_panel_is_an_edge(case: Ways) -> None:
         assert sensor.edge.value_m == case.value
 
 
-def test_a_seam_is_left_along_another_once_which_is_asked_for_at_the_sensors_place() -> None:
+def test_a_sensor_may_leave_a_seam_along_another_one_once() -> None:
     sensor = Sensor(Map(seams=("x", "y")))
     sensor.off(0.001, 0.0003)
     assert not sensor.walk(LIMIT_M, 0.3 * LIMIT_M, 60)  # 1 mm beyond what the first allows
@@ -320,7 +320,7 @@ def test_a_narrow_seam_may_be_crossed_at_a_greater_slant(gap_m: float) -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_an_edge_met_in_turning_may_be_turned_back_and_not_on(sign: float) -> None:
+def test_at_an_edge_found_in_a_turn_only_the_turn_back_is_permitted(sign: float) -> None:
     sensor = Sensor(Map(is_rim=True))
     assert not sensor.off(turn=sign * 0.005)
     assert sensor.off(turn=sign * 0.005)
@@ -338,7 +338,7 @@ def test_an_edge_met_in_turning_may_be_turned_back_and_not_on(sign: float) -> No
     assert not episode.permits_turn
 
 
-def test_an_edge_met_in_driving_permits_no_turn() -> None:
+def test_an_edge_found_in_driving_permits_no_turn() -> None:
     sensor = Sensor(Map(is_rim=True))
     # Less translation than half the wheel base per radian is a turn, more is none.
     sensor.off(HALF_BASE_M * 0.1 * 1.01, turn=0.1)
@@ -445,7 +445,7 @@ def test_at_rest_an_episode_ends_after_a_long_time_and_an_edge_once_the_sensor_i
     assert sensor.on()
 
 
-def test_chatter_begins_to_count_anew() -> None:
+def test_after_chatter_the_count_starts_again() -> None:
     sensor = Sensor(Map())
     sensor.off(0.001)
     for _ in range(3):
@@ -469,7 +469,7 @@ def test_an_unknown_position_makes_every_seam_possible() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("heading", [0.0, 3.0])
-def test_what_a_turn_adds_counts_across_the_seam(sign: float, heading: float) -> None:
+def test_motion_by_a_turn_counts_across_the_seam(sign: float, heading: float) -> None:
     """The robot drives on to the seam and then turns: the sensor goes on across it without the robot."""
     limit = GAP_M + DANGER.gap_tolerance_m + DANGER.seam_extra_m
     sensor = Sensor(Map(seams=("x",)), (0.0, 0.0, heading), -heading)
@@ -497,7 +497,7 @@ def test_a_sensor_about_which_the_robot_turns_does_not_move() -> None:
 
 
 @pytest.mark.parametrize("heading", [0.5, -2.0])
-def test_an_edge_met_in_turning_is_reported_at_every_heading(heading: float) -> None:
+def test_an_edge_found_in_a_turn_is_recognized_at_every_heading(heading: float) -> None:
     sensor = Sensor(Map(is_rim=True), (1.0, 2.0, heading))
     sensor.off(HALF_BASE_M * 0.01 * 1.05, turn=0.01)
     assert not sensor.episode.is_from_turn
@@ -516,7 +516,7 @@ def test_on_and_the_way_back_from_an_edge_are_reported() -> None:
     assert not sensor.episode.is_on
 
 
-def test_one_to_be_trusted_is_moved_back_from_where_it_is() -> None:
+def test_after_a_confirmation_the_retreat_is_measured_from_there() -> None:
     sensor = Sensor(Map(is_rim=True))
     sensor.off(0.001)
     assert sensor.off(0.001)

@@ -195,7 +195,7 @@ def test_lifted_keeps_the_rule_awake_without_an_episode(rule: Rule) -> None:
     assert not rule.rule.is_idle
 
 
-def test_a_reset_forgets_all_but_the_counts(rule: Rule) -> None:
+def test_a_reset_keeps_only_the_counts(rule: Rule) -> None:
     rule.feed([OFF], v=0.1)
     rule.rule.reset()
     rule.t_s = 0.0
@@ -204,7 +204,7 @@ def test_a_reset_forgets_all_but_the_counts(rule: Rule) -> None:
     assert rule.rule.opened == [2, 2, 2, 2]
 
 
-def test_a_reset_forgets_the_wheels_of_the_clock_before(rule: Rule) -> None:
+def test_a_reset_drops_the_wheel_samples_of_the_old_clock(rule: Rule) -> None:
     rule.feed([ON] * 200)
     rule.rule.reset()
     rule.t_s = 0.0
@@ -212,7 +212,7 @@ def test_a_reset_forgets_the_wheels_of_the_clock_before(rule: Rule) -> None:
     assert rule.rule.declared == [1, 0, 0, 0]
 
 
-def test_put_back_the_episodes_begin_anew(rule: Rule) -> None:
+def test_after_the_robot_is_put_back_the_episodes_start_again(rule: Rule) -> None:
     rule.feed([OFF_FL] * 80, v=0.1)
     assert rule.rule.episodes[0] is not None
     assert rule.rule.episodes[0].edge is not None
@@ -264,7 +264,7 @@ def phase_of(episode: EdgeEpisode) -> EdgePhase:
     return episode.phase
 
 
-def test_a_sensor_that_a_fix_shows_over_a_seam_begins_anew_there(rule: Rule) -> None:
+def test_a_sensor_that_a_fix_shows_over_a_seam_starts_a_new_episode_there(rule: Rule) -> None:
     known = declared(rule)
     rule.map.seam = SEAM
     anew = measured(rule, 4.9e-4)
@@ -297,7 +297,7 @@ def test_the_map_is_asked_with_the_slack_of_fix_and_heading(rule: Rule, cfg: Con
     assert rule.map.slacks_m == [pytest.approx(extra_m + slack_m)]
 
 
-def test_one_that_a_fix_shows_at_the_rim_is_not_to_blame_for_staying_off(rule: Rule) -> None:
+def test_a_sensor_that_a_fix_shows_at_the_rim_is_not_suspect(rule: Rule) -> None:
     episode = declared(rule)
     assert episode.retreat_m > 0.007
     episode.is_suspect = rule.map.is_rim = True
@@ -310,7 +310,7 @@ def test_one_that_a_fix_shows_at_the_rim_is_not_to_blame_for_staying_off(rule: R
     assert episode.retreat_m == pytest.approx(0.005, abs=1e-4)
 
 
-def test_where_a_fix_shows_neither_it_is_to_blame(rule: Rule) -> None:
+def test_a_sensor_that_a_fix_shows_at_no_edge_stays_suspect(rule: Rule) -> None:
     episode = declared(rule)
     episode.is_suspect = True
     assert measured(rule, 4.9e-4) is episode
@@ -328,7 +328,7 @@ def test_where_a_fix_shows_neither_it_is_to_blame(rule: Rule) -> None:
         (1e-5, 0.0, -0.004, True),
     ],
 )
-def test_what_is_a_fix(rule: Rule, sigma_m: float, v: float, omega: float, is_fix: bool) -> None:
+def test_which_decrease_of_sigma_is_a_fix(rule: Rule, sigma_m: float, v: float, omega: float, is_fix: bool) -> None:
     episode = declared(rule)
     rule.map.seam = SEAM
     assert (measured(rule, sigma_m, v=v, omega=omega) is not episode) is is_fix
@@ -336,7 +336,7 @@ def test_what_is_a_fix(rule: Rule, sigma_m: float, v: float, omega: float, is_fi
         assert (measured(rule, 1e-5) is not episode) is is_fix  # nor afterwards
 
 
-def test_a_fix_counts_against_the_vaguest_since_the_robot_stands(rule: Rule) -> None:
+def test_a_fix_is_compared_with_the_largest_sigma_since_the_robot_stands(rule: Rule) -> None:
     episode = declared(rule)
     rule.map.seam = SEAM
     measured(rule, 3e-3)
@@ -353,7 +353,7 @@ def test_each_fix_counts_once(rule: Rule) -> None:
     assert measured(rule, 1e-5) is episode
 
 
-def test_what_is_no_edge_or_on_again_is_left_alone(rule: Rule) -> None:
+def test_a_fix_changes_no_episode_without_an_edge_or_on_again(rule: Rule) -> None:
     episode = declared(rule)
     rule.map.seam = SEAM
     assert measured(rule, 1e-5, flags=ON) is episode
@@ -370,7 +370,7 @@ def test_without_an_estimate_there_is_no_fix(rule: Rule) -> None:
     assert rule.rule.episodes[0] is episode
 
 
-def test_a_reset_forgets_how_vague_the_pose_was(rule: Rule) -> None:
+def test_a_reset_drops_the_largest_sigma(rule: Rule) -> None:
     declared(rule)
     rule.rule.reset()
     rule.feed([OFF_FL] * 80, v=0.1)

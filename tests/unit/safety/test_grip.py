@@ -75,11 +75,11 @@ def test_a_turn_that_the_wheels_do_not_make_counts_with_it() -> None:
     [(0.0, 0.9, 1.2), (-5.0, 0.9, 0.0), (5.0, 0.0, 0.0), (20.0, 0.9, 0.0)],
     ids=["wheels that brake", "uphill", "on a level", "more than gravity: the sensor"],
 )
-def test_what_is_no_slide(slide_m_s2: float, ahead: float, braking_m_s2: float) -> None:
+def test_motion_that_is_no_slide(slide_m_s2: float, ahead: float, braking_m_s2: float) -> None:
     assert found_after_s(slide_m_s2, ahead, braking_m_s2=braking_m_s2, noise_m_s2=0.3) is None
 
 
-def test_what_the_robot_says_of_itself_counts(config: Config, mirror: Mirror) -> None:
+def test_a_slide_that_the_robot_reports_counts(config: Config, mirror: Mirror) -> None:
     monitor = DangerMonitor(mirror, config.robot, config.danger, config.health)
     robot = motor_robot(config)
     frame = robot.delivered
@@ -103,7 +103,7 @@ def test_its_row_holds_the_wheels_with_full_fans_until_a_fix_and_another_slide_i
 @pytest.mark.parametrize(
     ("margin", "row"), [(0.0, None), (1.3, None), (1.2, GRIP_LITTLE), (1.04, GRIP_TOO_LITTLE), (0.5, GRIP_TOO_LITTLE)]
 )
-def test_what_the_measured_margin_leads_to(margin: float, row: Condition | None) -> None:
+def test_the_measured_margin_gives_its_finding(margin: float, row: Condition | None) -> None:
     monitor = GripMonitor(CFG.health, CFG.robot)
     monitor.take_margin(margin)
     assert (monitor.finding and monitor.finding.condition) is row
@@ -178,7 +178,7 @@ def test_means_are_not_taken_for_single_differences(seed: int) -> None:
     assert 0.0 < found.found_s[-1] - 39.0 <= 0.05 + 1e-9
 
 
-def test_contacts_are_forgotten_and_a_slide_is_none() -> None:
+def test_contacts_expire_and_a_slide_is_no_contact() -> None:
     rule = SlideRule(0.055, 0.04)
     for k in range(100):
         rule.step(DT_S, (0.0, 0.03, 0.0, -0.09)[k % 4], 0.0, 0.0, (1.0, 0.0))
