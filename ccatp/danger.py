@@ -32,7 +32,7 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.safety.edge_episode import FoundEdge
 from ccatp.safety.edge_map import EdgeMap
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
-from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
+from ccatp.safety.escalation import SeverityEscalation, most_severe, with_findings
 from ccatp.safety.health_monitor import HealthMonitor
 from ccatp.safety.rules import SafetyRules
 from ccatp.sensing.sample_times import possible_samples
@@ -257,7 +257,7 @@ class DangerMonitor(SafetyRules):
         return next((e.edge for e in self._edges.episodes if e is not None and e.edge is not None), None)
 
     def _arbitrate(self, seq: int, t_s: float, findings: Sequence[MonitorFinding]) -> Verdict:
-        missing = gravest(findings)
+        missing = most_severe(findings)
         if self._edges.is_lifted:
             row = conditions.ALL_OFF
             permits = row.motion.permits()

@@ -75,7 +75,7 @@ def find_limit_s(row: Condition, cfg: object) -> float:
     return float(value)
 
 
-def gravest(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
+def most_severe(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
     """The finding with the highest severity; of equal ones that of the lowest precedence number."""
     return max(findings, key=lambda finding: (finding.severity, -finding.condition.precedence), default=None)
 
@@ -91,7 +91,7 @@ def with_findings(verdict: Verdict, findings: Sequence[MonitorFinding]) -> Verdi
     The event code stays. The cause becomes that of the most severe finding, except that a declared edge keeps its cause
     until something holds the wheels, and an emergency until a return or a fault is found.
     """
-    top = gravest(findings)
+    top = most_severe(findings)
     if top is None:
         return verdict
     holds = denies(findings)

@@ -23,7 +23,7 @@ LATE_S = 0.1
 _SAME_TURN_RAD = 0.05
 # With fewer encoder samples than usual a speed is inaccurate: the limits are multiplied by this factor, or a longer
 # period is judged.
-_VAGUE = 2.5
+_SPARSE_FACTOR = 2.5
 # A held wheel that creeps for longer than this does not stop by itself.
 _CREEP_FAULT_S = 1.0
 _SIDES = ("right", "left")
@@ -150,18 +150,18 @@ class WheelMonitor(Monitor):
         if frames.is_sparse:
             self._sparse_s = t_s
         recent = self._commanded(t_s)
-        is_vague = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
+        is_sparse = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
         if recent is not None:
             limit = self._cfg.runaway_m_s
             if brief is not None:
-                self._find_runaway(t_s, brief, recent, samples, _VAGUE * limit if is_vague else limit)
-            if is_vague and stalling is not None:
+                self._find_runaway(t_s, brief, recent, samples, _SPARSE_FACTOR * limit if is_sparse else limit)
+            if is_sparse and stalling is not None:
                 self._find_runaway(t_s, stalling, recent, samples, limit)
             if stalling is not None:
                 self._find_stall(t_s, stalling)
                 self._find_creep(now, stalling, recent, samples)
         if turning is not None:
-            self._compare_turns(t_s, turning, _VAGUE if is_vague else 1.0)
+            self._compare_turns(t_s, turning, _SPARSE_FACTOR if is_sparse else 1.0)
 
     def _commanded(self, t_s: float) -> SetPointSpan | None:
         """Recent set points of the wheels; ``None`` where they are not known."""
@@ -248,12 +248,12 @@ class WheelMonitor(Monitor):
                 finding = conditions.WHEEL_DOES_NOT_STOP.found(wheel, speed_m_s, limit_m_s, side=side)
             self.alarm.see(t_s, finding)
 
-    def _compare_turns(self, t_s: float, moved: MotionSum, vagueness: float) -> None:
-        """Compare the turns of gyroscope, while plausible, and wheels; ``vagueness`` multiplies the limit."""
+    def _compare_turns(self, t_s: float, moved: MotionSum, factor: float) -> None:
+        """Compare the turns of gyroscope, while plausible, and wheels; ``factor`` multiplies the limit."""
         cfg, (_, right_m, left_m, by_gyroscope) = self._cfg, moved
         by_wheels = (right_m - left_m) / self._base_m
         difference = by_gyroscope - by_wheels
-        limit = vagueness * (cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope)))
+        limit = factor * (cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope)))
         if not -limit <= difference <= limit:
             self.yaw.see(t_s, conditions.YAW_DISAGREES.found("imu_wz", difference, limit))
 

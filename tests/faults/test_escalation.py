@@ -18,7 +18,7 @@ from ccatp.danger import DangerMonitor
 from ccatp.links.bus import EstimateSubscriber
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
-from ccatp.safety.escalation import SeverityEscalation, denies, gravest
+from ccatp.safety.escalation import SeverityEscalation, denies, most_severe
 from ccatp.sim.robot import Robot
 from tests.support.rows import DANGER
 
@@ -37,7 +37,7 @@ FINDINGS = st.lists(st.builds(finding, st.sampled_from(list(Severity)[1:]), st.s
 
 @given(FINDINGS)
 def test_the_highest_severity_counts_and_any_hold_denies(findings: list[MonitorFinding]) -> None:
-    top = gravest(findings)
+    top = most_severe(findings)
     assert (top is None) == (not findings)
     if top is not None:
         assert top.severity == max(one.severity for one in findings)

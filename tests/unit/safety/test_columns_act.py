@@ -27,7 +27,7 @@ from ccatp.daemon.operator.alarms import active_cause
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety import edge_episode, emergency_latch
 from ccatp.safety.emergency_latch import EmergencyLatch
-from ccatp.safety.escalation import SeverityEscalation, gravest, with_findings
+from ccatp.safety.escalation import SeverityEscalation, most_severe, with_findings
 from ccatp.survey.engagement import EngagedMission, Engagement
 from ccatp.survey.events import EstimateDiverged, Fault, Interrupted, Mode
 from ccatp.survey.state import SurveyState
@@ -101,8 +101,8 @@ def test_full_fans_are_those_of_the_row(row: Condition) -> None:
 def test_precedence_selects_the_cause_of_equal_severity(row: Condition) -> None:
     other = replace(row, name="another", precedence=row.precedence + 1)
     found = row.found("x", 2.0, 1.0), other.found("y", 2.0, 1.0)
-    assert gravest(found) is found[0]
-    assert gravest((found[0], replace(other, precedence=row.precedence - 1).found("y", 2.0, 1.0))) is not found[0]
+    assert most_severe(found) is found[0]
+    assert most_severe((found[0], replace(other, precedence=row.precedence - 1).found("y", 2.0, 1.0))) is not found[0]
 
 
 LASTING = [row for row in FOUND if row.limit]

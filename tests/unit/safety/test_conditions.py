@@ -27,7 +27,7 @@ from ccatp.core import EdgeSample, EventCode, ImuSample, Severity, Verdict, Whee
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
-from ccatp.safety.escalation import gravest
+from ccatp.safety.escalation import most_severe
 from tests.support.rows import DANGER
 from tests.support.scenario import config_of, mirror_of
 
@@ -355,7 +355,7 @@ def test_of_two_the_more_severe_counts_and_of_equal_ones_the_lowest_number() -> 
     for first, second in combinations(DANGER, 2):
         found = first.found("a", 1.0, 0.0), second.found("b", 1.0, 0.0)
         winner = min(found, key=lambda one: (-one.severity, one.condition.precedence))
-        assert gravest(found) is gravest(found[::-1]) is winner, f"{first.name} and {second.name}"
+        assert most_severe(found) is most_severe(found[::-1]) is winner, f"{first.name} and {second.name}"
 
 
 def test_what_the_gyroscope_shows_at_rest_is_no_turn_afterwards() -> None:
