@@ -118,8 +118,9 @@ class SeamMonitor(Monitor):
         self._inside_m = 0.0  # lower bound of the distance of all sensors from their panels' edges; 0: look up again
 
     def findings(self, t_s: float) -> list[MonitorFinding]:
-        """See ``Monitor``."""
-        return [*super().findings(t_s), *([] if self.finding is None else [self.finding])]
+        """See ``Monitor``; and about the sensor that missed most seams in a row, if these are enough."""
+        found, blindest = super().findings(t_s), self._blindest()
+        return found if blindest is None else [*found, blindest]
 
     def went_off(self, sensor: int) -> None:
         """Report that a sensor went off or is off: it is not blind."""
@@ -170,9 +171,7 @@ class SeamMonitor(Monitor):
             # The pose may be wrong instead. The hold brings a fix, and the next seam shows which of them is wrong.
             self._blind.see(self._pose[0], conditions.EDGE_SENSOR_BLIND.found(_CORNERS[i], missed, limit))
 
-    @property
-    def finding(self) -> MonitorFinding | None:
-        """The finding about the sensor that missed most seams in a row, if these are enough."""
+    def _blindest(self) -> MonitorFinding | None:
         if self._blind.finding is not None:
             return self._blind.finding
         most, limit = max(self.missed), self._cfg.seams_suspect

@@ -38,7 +38,7 @@ class GripMonitor(Monitor):
         """See ``Monitor``."""
         super().reset()
         self._rule = SlideRule(self._slide_m_s, self._turn_rad)
-        self.finding: MonitorFinding | None = None
+        self.finding = None
         self.noise: MonitorFinding | None = None
         self._ahead = 0.0
         self._bias_m_s2 = 0.0
@@ -47,7 +47,10 @@ class GripMonitor(Monitor):
 
     def findings(self, t_s: float) -> list[MonitorFinding]:
         """See ``Monitor``."""
-        return [*super().findings(t_s), *(one for one in (self.finding, self.noise) if one is not None)]
+        found = super().findings(t_s)
+        if self.noise is not None:
+            found.append(self.noise)
+        return found
 
     def take_margin(self, margin: float) -> None:
         """Take main's margin: full thrust over the least that holds the robot everywhere; 0: not measured."""

@@ -51,7 +51,7 @@ class ImuMonitor(Monitor):
         return (wz - self.bias_rad_s) * dt_s
 
     def findings(self, t_s: float) -> list[MonitorFinding]:
-        """See ``Monitor``."""
+        """See ``Monitor``; and that the readings are left out."""
         found, gate = super().findings(t_s), self._gate
         if gate.cause:
             found.append(conditions.IMU_LEFT_OUT.found("imu", gate.value, gate.limit, what=gate.cause))

@@ -7,9 +7,11 @@ from ccatp.safety.escalation import FindingLatch
 class Monitor:
     """A monitor of the danger loop. ``HealthMonitor`` registers it, resets it, and asks it for its findings.
 
-    A latch that a monitor makes with ``latch`` is among its findings. A monitor with a finding that is not latched
-    extends ``findings``.
+    Its findings are those of the latches that it makes with ``latch``, and ``finding``, which lasts until the monitor
+    changes it. A monitor with others extends ``findings``.
     """
+
+    finding: MonitorFinding | None = None
 
     def __init__(self) -> None:
         self._latches: list[FindingLatch] = []
@@ -27,8 +29,10 @@ class Monitor:
 
     def findings(self, t_s: float) -> list[MonitorFinding]:
         """The findings at ``t_s``."""
-        return [
-            finding
-            for latch in self._latches
-            if latch.finding is not None and (finding := latch.settle(t_s)) is not None
-        ]
+        found = []
+        for latch in self._latches:
+            if latch.finding is not None and (finding := latch.settle(t_s)) is not None:
+                found.append(finding)
+        if self.finding is not None:
+            found.append(self.finding)
+        return found

@@ -23,17 +23,13 @@ class RateMonitor(Monitor):
     def reset(self) -> None:
         """See ``Monitor``."""
         super().reset()
-        self.finding: MonitorFinding | None = None
+        self.finding = None
         self.are_encoders_sparse = False
         self._begin_s: float | None = None
         self._last_s = 0.0
         self._counts = [0, 0, 0]
         self._usual_hz: list[float] | None = None
         self._before_hz: list[float] = []
-
-    def findings(self, t_s: float) -> list[MonitorFinding]:
-        """See ``Monitor``."""
-        return [*super().findings(t_s), *([] if self.finding is None else [self.finding])]
 
     def step(self, t_s: float, imu: int, encoders: int, edges: int) -> None:
         """Take the numbers of samples of a frame; judged once per ``rate_time_s``."""

@@ -85,7 +85,7 @@ class BatteryMonitor(Monitor):
     def __init__(self, cfg: HealthConfig) -> None:
         super().__init__()
         self._cfg = cfg
-        self.finding: MonitorFinding | None = None
+        self.finding = None
         self.reset()
 
     def reset(self) -> None:
@@ -93,10 +93,6 @@ class BatteryMonitor(Monitor):
         super().reset()
         self._low = Since()
         self._reported = Since()
-
-    def findings(self, t_s: float) -> list[MonitorFinding]:
-        """See ``Monitor``."""
-        return [*super().findings(t_s), *([] if self.finding is None else [self.finding])]
 
     def step(self, t_s: float, soc: float, is_reported: bool, home_m: float) -> None:
         """Judge a frame; ``soc`` from 0 to 1, ``home_m``: length of the way home."""

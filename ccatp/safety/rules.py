@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ccatp.conditions.danger import NO_FRAME
-from ccatp.core import NO_CAUSE, EventCode, Verdict
+from ccatp.core import Verdict
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.safety.emergency_latch import EmergencyRules
@@ -39,8 +39,7 @@ class SafetyRules(EmergencyRules):
         if estimate is not None:
             self._state = estimate.state
             self._state_seq = estimate.seq
-        free = Verdict(seq, t_s, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, True, True, True)
-        return self.latch.with_emergencies(self.latch.verdict(seq, t_s) or free)
+        return self.latch.with_emergencies(self.latch.verdict(seq, t_s) or Verdict.normal(seq, t_s))
 
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict without a fresh frame: no motion."""
