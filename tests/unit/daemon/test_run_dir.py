@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from ccatp.beacons.config.load import load_radio_config
-from ccatp.beacons.daemon.run import PROCESSES as BEACON_PROCESSES
+from ccatp.beacons.daemon.beacon_run import PROCESSES as BEACON_PROCESSES
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE
