@@ -19,6 +19,7 @@ from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
 from tests.support.runs import RecordedRun, record_once
 from tests.support.scenario import config_of, mirror_of
+from tests.support.temporary import session_folder
 
 pytest_plugins = ["pytester", "tests.faults.linking"]
 
@@ -60,10 +61,16 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def own_runtime_dir() -> Iterator[None]:
-    """A daemon or server that names no runtime directory shares it with this worker's tests only."""
-    with tempfile.TemporaryDirectory(prefix="ccatp-") as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CCATP_RUNTIME_DIR", folder)
+def own_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Temporary files of this worker's tests and of their processes lie in one folder, which does not outlive them.
+
+    A daemon or server that names no runtime directory shares it with these tests only.
+    """
+    tmp_path_factory.getbasetemp()  # stays where it is: it holds what failed tests leave to be looked at
+    with session_folder(Path(tempfile.gettempdir())) as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(folder))
+        patch.setenv("TMPDIR", str(folder))
+        patch.setenv("CCATP_RUNTIME_DIR", str(folder / "run"))
         yield
 
 
