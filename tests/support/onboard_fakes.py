@@ -305,7 +305,7 @@ class FakePwm:
         return self._open(path, flags, *args, **kwargs)
 
     def pwrite(self, fd: int, data: bytes, offset: int) -> int:
-        path = os.readlink(f"/proc/self/fd/{fd}")
+        path = str(Path(f"/proc/self/fd/{fd}").readlink())
         if not path.startswith(f"{self.root}/"):
             return self._pwrite(fd, data, offset)
         name, value = path.removeprefix(f"{self.root}/"), int(data)

@@ -10,8 +10,8 @@ from ccatp.config.package import configs_dir
 from ccatp.links.topics import schema_of
 from ccatp.records.recorder import Recorder
 from tests.support.command import refused
-from tests.unit.beacons.cli.test_command_radio import CORNERS, places
-from tests.unit.beacons.cli.test_command_radio_map import ranges_file, truth_file
+from tests.unit.beacons.cli.test_radio import CORNERS, places
+from tests.unit.beacons.cli.test_radio_map import ranges_file, truth_file
 from tests.unit.beacons.cricket.fields import ALL
 from tests.unit.beacons.datasets.sets import csv_lines, world, write_lines
 

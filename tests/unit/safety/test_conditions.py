@@ -318,7 +318,7 @@ ELSEWHERE = {
         *(rows.ALL_OFF, rows.EARTHQUAKE, rows.EMERGENCY),
     ),
     "tests/unit/sensing/test_sample_times.py": (rows.SAMPLES_MISDATED,),
-    "tests/unit/safety/test_grip.py": (
+    "tests/unit/safety/test_grip_monitor.py": (
         rows.GRIP_LOST,
         rows.GRIP_LITTLE,
         rows.GRIP_TOO_LITTLE,
