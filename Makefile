@@ -43,6 +43,16 @@ help:
 	@echo "make format           format the code"
 	@echo "make lock             pin the dependencies again (needs uv)"
 	@echo "make clean            remove the environment and every cache; runs/ stays"
+	@echo
+	@echo "Programs that are started by hand, in $(VENV)/bin; --help and the first lines of each file say more:"
+	@echo "python -m tools.gap_campaign             is the estimate consistent in gaps of the samples; hours [--seeds 20]"
+	@echo "python -m tools.night FOLDER             a night with six faults, and docs/night.md of it"
+	@echo "python -m tools.onboard_reactions        reaction times of the robot's own program [--trials 20]"
+	@echo "python -m tools.page_cost [SECONDS [ROUNDS]]  what open pages cost the dashboard and the main loop"
+	@echo "python -m tools.page_load [HOURS [SECONDS]]   memory of the page and of the dashboard in a long mission"
+	@echo "python -m tools.metrics.frame_profile    where the CPU time of a frame goes, by process"
+	@echo "python -m tools.screenshots dashboard [FOLDER]  pictures of the page for docs/; report RUN_DIR: of a report"
+	@echo "python -m tools.physics_picture          docs/measurements/physics.png; needs MUJOCO_GL=egl"
 
 run: $(VENV)/.installed
 	@$(BIN)/ccatp run --sim $(ARGS)
