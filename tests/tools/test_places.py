@@ -8,10 +8,10 @@ PACKAGE, TESTS, TOOLS = ROOT / "ccatp", ROOT / "tests", ROOT / "tools"
 UNIT = TESTS / "unit"
 # Files of tests that are about no one module of the folder, or of those below it.
 OF_SEVERAL_MODULES = {
-    "beacons/report/test_beacon_report", "beacons/studies/test_beacon_studies", "beacons/test_driving", "cli/test_cli",
-    "cli/test_cli_commands", "cli/test_refusals", "config/test_config", "daemon/test_service", "daemon/test_telemetry",
+    "beacons/report/test_beacon_report", "beacons/studies/test_beacon_studies", "beacons/test_driving",
+    "cli/test_cli_commands", "cli/test_refusals", "daemon/test_service", "daemon/test_telemetry",
     "beacons/cli/test_radio_map", "control/test_tracker_pid", "estimation/test_replay_buffer",
-    "estimation/test_sample_validation", "filters/test_filters", "mirror/test_length_judgement", "report/test_pages",
+    "estimation/test_sample_validation", "mirror/test_length_judgement", "report/test_pages",
     "report/dashboard/test_views", "safety/test_columns_act", "safety/test_conditions", "safety/test_united_findings",
     "studies/test_mission_studies", "survey/test_mission", "test_constructors", "test_names_decide",
 }  # fmt: skip
