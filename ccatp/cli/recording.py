@@ -98,11 +98,11 @@ def export(path: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: 
     """
     from ccatp.mirror.mirror import build_mirror
     from ccatp.records.recorder import iter_messages
-    from ccatp.records.run_reader import format_tum, open_run
+    from ccatp.records.run_reader import format_tum, open_recordings
 
     if not (tum_file or truth_file or bag_dir):
         raise click.UsageError("nothing to write; give --tum, --truth or --ros2")
-    newest = open_run(path)[-1]
+    newest = open_recordings(path)[-1]
     if not any(message.topic == "sensors" for message in iter_messages(newest.path)):
         raise ConfigError(f"{newest.path}: no sensors frames in it, so there is nothing to export")
     cfg = newest.config({})

@@ -162,10 +162,10 @@ def align(
 @common.JSON_OPTION
 def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Path | None, json_output: bool) -> int:
     """Run an estimator again over the recorded samples of a run, as it was or with other settings."""
-    from ccatp.records.run_reader import open_run
+    from ccatp.records.run_reader import open_recordings
     from ccatp.studies.replay import csv_lines, has_smoother, judge, table_lines
 
-    recordings = open_run(run_dir)
+    recordings = open_recordings(run_dir)
     configs = [recording.config(settings) for recording in recordings]
     _check_effect(settings, REPLAY_KEYS, "a replay")
     if smooth and not all(map(has_smoother, configs)):

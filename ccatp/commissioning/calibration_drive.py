@@ -15,7 +15,7 @@ from ccatp.core import Fix, FloatArray
 from ccatp.estimation.odometry import Terrain, WheelAngle
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.records.run_reader import Marked, in_order, open_run
+from ccatp.records.run_reader import Marked, in_order, open_recordings
 
 # The robot is at rest in a frame if no wheel turns by more than both of these: an angle, and a multiple of the standard
 # deviation of the frame's summed encoder noise.
@@ -343,7 +343,7 @@ def read_drive(run_dir: Path) -> ReadDrive:
 
     Raises RunReadError: no recording can be read. Raises ConfigError: its configuration cannot be used.
     """
-    recording = open_run(run_dir)[-1]
+    recording = open_recordings(run_dir)[-1]
     cfg = recording.config({})
     mirror = build_mirror(cfg.mirror)
     builder, fixes = DriveBuilder(mirror, cfg.robot.puck_height_m), 0

@@ -67,6 +67,23 @@ class Placed(NamedTuple):
     message: Message
 
 
+class RecordedFrame(NamedTuple):
+    """A frame on the axis of its recording: number and mission time, the message, and its line."""
+
+    number: int
+    t_s: float
+    sensors: Sensors
+    line: bytes
+
+
+def _frames(timeline: Timeline, place: int, message: topics.SensorLines) -> list[RecordedFrame]:
+    decoded = [(decode_from_robot(line), line) for line in map(bytes, message.lines)]
+    read = [(sensors, line) for sensors, line in decoded if isinstance(sensors, Sensors)]
+    numbers = timeline.line_numbers(place, [sensors.seq for sensors, _ in read])
+    times_s = timeline.times(np.array(numbers)).tolist()
+    return [RecordedFrame(*at, *one) for at, one in zip(zip(numbers, times_s, strict=True), read, strict=True)]
+
+
 def _fixed(number: int, t_s: float, message: topics.FixMessage) -> Fixed:
     fix = msgspec.convert(message, Fix, from_attributes=True)
     return Fixed(number, t_s, fix, message.is_fused, message.is_set_aside)
@@ -245,11 +262,7 @@ class Recording:
 
     def _take(self, timeline: Timeline, place: int, message: object) -> list[Placed]:
         if isinstance(message, topics.SensorLines):
-            frames = [decode_from_robot(bytes(line)) for line in message.lines]
-            read = [frame for frame in frames if isinstance(frame, Sensors)]
-            numbers = timeline.line_numbers(place, [frame.seq for frame in read])
-            times_s = timeline.times(np.array(numbers)).tolist()
-            return [Placed(*row) for row in zip(numbers, times_s, read, strict=True)]
+            return [Placed(number, t_s, sensors) for number, t_s, sensors, _ in _frames(timeline, place, message)]
         if isinstance(message, topics.Rest | topics.Treatment | topics.FixMessage):
             number = timeline.number_at(place, message.seq)
             return [Placed(number, timeline.at(number), message)]
@@ -264,6 +277,25 @@ class Recording:
         else:
             self.arrivals.append(placed.seq)
         return []
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Frames with growing numbers; what cannot be read is counted in ``warnings`` at the end."""
+        timeline, last, lost = self.timeline, -1, list[str]()
+        for place, topic, _, payload in iter_places(self.path):
+            if topic != "sensors":
+                continue
+            try:
+                message = decode_recorded(topic, payload)
+                found = _frames(timeline, place, message) if isinstance(message, topics.SensorLines) else []
+            except (BadMessage, BadLine) as error:
+                lost.append(str(error))
+                continue
+            for frame in found:
+                if frame.number > last:
+                    yield frame
+                    last = frame.number
+        if lost:
+            self.warnings.append(f"{self.path}: {len(lost)} batches of frames cannot be read: {lost[0]}")
 
     def recorded(self, mirror: Mirror) -> Trace:
         """The estimates of the run itself."""
@@ -282,7 +314,7 @@ def check_run_dir(run_dir: Path, file: str = CONFIG) -> None:
         raise RunReadError(f"{run_dir}: no {file} there; name the directory of a run")
 
 
-def open_run(path: Path) -> list[Recording]:
+def open_recordings(path: Path) -> list[Recording]:
     """The recordings of a run directory, oldest first, or the one that is named; ``RunReadError``: none can be read.
 
     A session that was refused, or that ended before it had reached the robot, has recorded no frame. It is left out

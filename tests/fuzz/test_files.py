@@ -21,7 +21,7 @@ from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
 from ccatp.links.topics import FixMessage, Rest, SensorLines, TrackMessage, all_topics, schema_of
 from ccatp.records.recorder import Recorder, iter_messages
-from ccatp.records.run_reader import RunReadError, open_run
+from ccatp.records.run_reader import RunReadError, open_recordings
 from ccatp.records.store import MissionStore, StoredPoint, StoreError
 from tests.contract.test_robot_wire import SENSORS_LINE
 from tests.fuzz.fuzzer import Target, fuzz
@@ -187,7 +187,7 @@ def recording_target(folder: Path) -> Target:
         path.write_bytes(data)
         damages: list[str] = []
         topics = tuple(message.topic for message in iter_messages(path, damages.append))
-        for recording in open_run(folder / "run"):
+        for recording in open_recordings(folder / "run"):
             count = sum(1 for _ in recording.messages())
             return topics, len(damages), min(count, 8), len(recording.warnings)
         raise AssertionError("no recording")

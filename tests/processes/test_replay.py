@@ -19,7 +19,7 @@ from ccatp.cli import main
 from ccatp.config.load import load_config
 from ccatp.config.package import configs_dir
 from ccatp.records.recorder import iter_messages
-from ccatp.records.run_reader import open_run
+from ccatp.records.run_reader import open_recordings
 from ccatp.studies.sil_run import rehearse
 from tests.faults.linking import Measured
 from tests.processes.conftest import Start
@@ -56,7 +56,7 @@ def test_the_same_filter_reproduces_the_run(recorded_run: RecordedRun, capsys: p
         assert recorded[name] == pytest.approx(summary[name], abs=2e-3)  # and has the frames before the first batch
     assert result["fixes"]["given"] >= 18
     assert not result["warnings"]
-    (recording,) = open_run(recorded_run.run_dir)
+    (recording,) = open_recordings(recorded_run.run_dir)
     assert recording.config({}) == load_config(recorded_run.run_dir / "config.toml")
 
 
@@ -100,7 +100,7 @@ def test_a_run_with_restarts_and_steps_of_the_clock_is_read_as_it_was(
     assert result["difference"]["reproduced"]
     for name in ("mean", "p50", "p99", "max"):
         assert result["recorded"]["position_error_mm"][name] == pytest.approx(summary[name], abs=2e-3)
-    (recording,) = open_run(run.run_dir)
+    (recording,) = open_recordings(run.run_dir)
     assert sum(step.kind == "restart" for step in recording.timeline.steps) == 2
     assert (np.diff(recording.timeline.t_s) > 0.0).all()
     frames = int(recording.timeline.number[-1])

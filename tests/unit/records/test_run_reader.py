@@ -22,7 +22,7 @@ from ccatp.links.topics import ArrivalMessage, Message, Rest, SensorLines, Track
 from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.records.recorder import RECORD_FORMAT, Recorder
-from ccatp.records.run_reader import RunReadError, open_run, read_run
+from ccatp.records.run_reader import RunReadError, open_recordings, read_run
 from ccatp.studies import replay as player
 from tests.support.command import printed, refused
 from tests.support.recorded import make_run, record_truth, recorder_in
@@ -73,7 +73,7 @@ def test_what_a_recording_holds(tmp_path: Path, config_text: str) -> None:
         config=config_text,
         format=str(RECORD_FORMAT),
     )
-    (recording,) = open_run(tmp_path)
+    (recording,) = open_recordings(tmp_path)
     found = list(recording.messages())
     assert isinstance(found[0].message, Rest)
     assert [(one.number, one.t_s) for one in found] == [(1, 0.01), (0, 0.0), (1, 0.01)]
@@ -96,7 +96,7 @@ def test_each_part_of_a_resumed_run_has_the_configuration_it_ran_with(tmp_path: 
     later = dump_config(load_config(None, {"run.filter": "ekf", "run.seed": 6}))
     record(tmp_path, [("sensors", batch(0))], config=later)
     (tmp_path / "config.toml").write_text(later)
-    parts = open_run(tmp_path)
+    parts = open_recordings(tmp_path)
     assert [part.config({}).run.seed for part in parts] == [5, 6]
     assert [part.config({"run.filter": "ukf"}).run.filter for part in parts] == ["ukf", "ukf"]
 
@@ -104,23 +104,23 @@ def test_each_part_of_a_resumed_run_has_the_configuration_it_ran_with(tmp_path: 
 def test_an_older_recording_is_read_with_the_configuration_beside_it(tmp_path: Path, config_text: str) -> None:
     record(tmp_path, [("sensors", batch(0))])
     (tmp_path / "config.toml").write_text(config_text)
-    assert open_run(tmp_path)[0].config({}).run.seed == 5
+    assert open_recordings(tmp_path)[0].config({}).run.seed == 5
 
 
 def test_a_session_without_a_frame_is_left_out_and_named(tmp_path: Path, config_text: str) -> None:
     """A resume that was refused leaves such a recording; the frames of the run are in an older one."""
     record(tmp_path, [("sensors", batch(0, 1))], config=config_text)
     record(tmp_path, [("rest", Rest(seq=0, t_s=0.0))], config=config_text)
-    (recording,) = open_run(tmp_path)
+    (recording,) = open_recordings(tmp_path)
     assert (recording.path.name, len(list(recording.messages()))) == ("telemetry.1.mcap", 2)
     assert recording.notes == [f"{tmp_path / 'telemetry.mcap'}: left out, it holds no frame of the robot"]
-    (alone,) = open_run(tmp_path / "telemetry.mcap")
+    (alone,) = open_recordings(tmp_path / "telemetry.mcap")
     assert not alone.has_frames()
 
 
 def test_missing_frames_are_counted(tmp_path: Path, config_text: str) -> None:
     record(tmp_path, [("sensors", batch(0, 1)), ("sensors", batch(4, 5, 9))], config=config_text)
-    (recording,) = open_run(tmp_path)
+    (recording,) = open_recordings(tmp_path)
     assert len(list(recording.messages())) == 5
     assert recording.warnings == [f"{recording.path}: 5 frames are missing in between"]
 
@@ -128,7 +128,7 @@ def test_missing_frames_are_counted(tmp_path: Path, config_text: str) -> None:
 def test_what_cannot_be_read_is_not_used_and_reported_once(tmp_path: Path, config_text: str) -> None:
     bad = SensorLines(seq=1, t_s=0.01, lines=[msgspec.Raw(b'{"type":"sensors"}')])
     record(tmp_path, [("sensors", batch(0)), ("sensors", bad), ("sensors", bad)], config=config_text)
-    (recording,) = open_run(tmp_path)
+    (recording,) = open_recordings(tmp_path)
     assert len(list(recording.messages())) == 1
     (warning,) = recording.warnings
     assert "what cannot be read is not used" in warning
@@ -139,7 +139,7 @@ def test_a_torn_file_is_read_up_to_its_damage(tmp_path: Path, config_text: str) 
     path = record(tmp_path, batches, config=config_text)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    (recording,) = open_run(tmp_path)
+    (recording,) = open_recordings(tmp_path)
     frames = [one.number for one in recording.messages()]
     assert frames == list(range(len(frames)))
     assert 100 <= len(frames) < 3000
@@ -150,25 +150,25 @@ def test_a_torn_file_is_read_up_to_its_damage(tmp_path: Path, config_text: str) 
 
 def test_what_is_no_run(tmp_path: Path, config_text: str) -> None:
     with pytest.raises(RunReadError, match="no such directory; name the directory of a run"):
-        open_run(tmp_path / "none")
+        open_recordings(tmp_path / "none")
     with pytest.raises(RunReadError, match=r"no telemetry\.mcap there"):
-        open_run(tmp_path)
+        open_recordings(tmp_path)
     record(tmp_path, [])
     with pytest.raises(RunReadError, match=r"no config\.toml there"):
-        open_run(tmp_path)
+        open_recordings(tmp_path)
 
 
 @pytest.mark.parametrize("number", [str(RECORD_FORMAT + 1), "two"])
 def test_a_newer_format_is_refused(number: str, tmp_path: Path, config_text: str) -> None:
     record(tmp_path, [], config=config_text, format=number, ccatp="9.9")
     with pytest.raises(RunReadError, match=rf"recorded in format {number} by ccatp 9\.9, this one reads up to"):
-        open_run(tmp_path)
+        open_recordings(tmp_path)
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "telemetry.mcap").mkdir()
     with pytest.raises(RunReadError, match="cannot be read: Is a directory"):
-        open_run(tmp_path)
+        open_recordings(tmp_path)
 
 
 # -- the command -------------------------------------------------------------------------------------------------------

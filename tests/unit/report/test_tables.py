@@ -25,7 +25,7 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import DangerEvent, MissionStatus
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.recorder import iter_logged
-from ccatp.records.run_reader import Recording, Trace, in_order, open_run
+from ccatp.records.run_reader import Recording, Trace, in_order, open_recordings
 from ccatp.report.run_page import report_run
 from ccatp.studies.replay import replay
 from tests.support.command import answered, printed, refused
@@ -176,7 +176,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def recording(run_dir: Path) -> Recording:
-    return open_run(run_dir)[-1]
+    return open_recordings(run_dir)[-1]
 
 
 @pytest.fixture(scope="module")
