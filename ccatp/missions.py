@@ -60,9 +60,10 @@ class MissionKind:
     limits: Part = Part("ccatp.daemon.loops.mission_runner:usual_limits")  # Callable[[C], LoopLimits]
     rules: Part = Part("ccatp.safety.rules:emergency_rules")  # Callable[[C], safety.rules.SafetyRules]
     stand_in: Part  # Callable[[C, dataloop.StandInOptions], dataloop.StandIn]
-    # Views: the web page of a run, the report on it.
+    # Views: the web page of a run, the report on it, its tables in Python.
     page: Part | None = None  # Callable[[C, Path, bool], report.dashboard.hub.Page]; None: it has no page
     report: Part | None = None  # Callable[[Path], report.html.RunReport]; None: it has no report
+    analysis: Part | None = None  # Callable[[Path], analysis.run.Run]; None: it has no tables
     # What it adds to the tables of the package.
     conditions: str = ""
     waits: Mapping[str, str] = field(default_factory=dict)

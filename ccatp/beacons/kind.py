@@ -19,6 +19,7 @@ BEACONS = MissionKind(
     stand_in=Part("ccatp.beacons.dataloop:beacon_stand_in"),
     page=Part("ccatp.beacons.report.dashboard.view:beacon_page"),
     report=Part("ccatp.beacons.report.page:beacon_report"),
+    analysis=Part("ccatp.beacons.analysis:open_beacons"),
     conditions="ccatp.beacons.conditions",
     waits={
         "mapping": "waits until the motes have measured each other, then drives to the first waypoint",

@@ -137,7 +137,7 @@ def align(
     if csv_file is not None:
         from ccatp.report.tables import csv_lines, panel_table
 
-        common.write_lines("--csv", csv_file, csv_lines(panel_table(mirror, result)))
+        common.write_lines("--csv", csv_file, csv_lines(panel_table(mirror, result.panels)))
     if figure_file is not None:
         from ccatp.report.mirror_map import draw_alignment
 

@@ -6,7 +6,7 @@ format of astropy (APE 6): a YAML header in comments, then CSV.
 
 import csv
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
@@ -14,8 +14,7 @@ from typing import NamedTuple
 from ccatp.config.files import write_file
 from ccatp.core import PointId
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.mirror_alignment import SurveyResult
-from ccatp.mirror.panel_alignment import adjuster_places
+from ccatp.mirror.panel_alignment import PanelResult, adjuster_places
 from ccatp.report.alignment import panel_data, worst_corner
 from ccatp.report.findings import Findings, metadata_of
 
@@ -23,7 +22,7 @@ FILE_MODE = 0o644
 _UNITS = frozenset(("um", "urad", "mm", "m", "m2", "s"))
 _TYPES = {
     **dict.fromkeys(("row", "col", "point", "points", "dof", "is_outlier", "is_bent"), "int64"),
-    **dict.fromkeys(("status", "channels", "outliers", "adjuster"), "string"),
+    **dict.fromkeys(("status", "channels", "metrology", "left_out", "outliers", "adjuster"), "string"),
 }  # of ECSV; all other columns are float64
 
 _PLACE = {"row": "row of the panel", "col": "column of the panel"}
@@ -39,6 +38,10 @@ _FIXES = {
     "dop": "dilution of precision",
     "residual_rms_m": "rms of the residuals of the lengths",
     "channels": "channels of the laser system that were used",
+    "metrology": "whether the lengths agree: good, unreliable, or unchecked; empty in runs of older versions",
+    "left_out": "channels that contradict the others and were left out",
+    "detectable_m": "smallest error of one length that the test of the lengths finds",
+    "protection_m": "largest error of the position by an error of one length that the test does not find",
     "deviation_um": "surface less the ideal one along its normal, > 0 towards the robot",
     "sigma_deviation_um": _SIGMA,
     "residual_um": "deviation less the fitted plane of the panel",
@@ -73,12 +76,10 @@ class Table(NamedTuple):
 
 def write_tables(found: Findings, folder: Path) -> None:
     """Write each table as CSV and as ECSV into a folder that exists; ConfigError: one cannot be written."""
-    mirror, result, metadata = found.record.mirror, found.alignment, metadata_of(found)
-    tables = {"fixes": _fixes_table(found)}
-    if result is not None:
-        panels = panel_table(mirror, result)
-        others = [{**one.panel._asdict(), "points": one.points} for one in result.undetermined]
-        tables |= {"panels": Table(panels.columns, [*panels.rows, *others]), "moves": _moves_table(mirror, result)}
+    metadata = metadata_of(found)
+    tables = {"fixes": fixes_table(found)}
+    if found.alignment is not None:
+        tables |= {"panels": all_panels_table(found), "moves": moves_table(found)}
     for name, table in tables.items():
         lines = [f"# {key}: {_yaml(value)}" for key, value in metadata.items()]
         write_file(folder / f"{name}.csv", "\n".join([*lines, *csv_lines(table), ""]), FILE_MODE)
@@ -111,7 +112,7 @@ def _yaml(value: object) -> str:
     return "".join(char if char.isprintable() else f"\\U{ord(char):08x}" for char in text)
 
 
-def _fixes_table(found: Findings) -> Table:
+def fixes_table(found: Findings) -> Table:
     """Every point of the mission, measured or not."""
     record, alignment = found.record, found.alignment
     fixes = {one.point: one.fix for one in record.measured}
@@ -128,7 +129,8 @@ def _fixes_table(found: Findings) -> Table:
             row |= {"t_s": fix.t_s, "dop": fix.dop, "residual_rms_m": fix.residual_rms_m}
             row |= zip(("x_m", "y_m", "z_m"), fix.position_m, strict=True)
             row |= {name: fix.covariance_m2[at] for name, at in _COVARIANCE.items()}
-            row["channels"] = " ".join(map(str, fix.channels))
+            row |= {"channels": _list(fix.channels), "metrology": fix.metrology, "left_out": _list(fix.left_out)}
+            row |= {"detectable_m": fix.detectable_m, "protection_m": fix.protection_m}
         if (one := deviations.get(stored.point)) is not None:
             row |= {"deviation_um": one["deviation_um"], "sigma_deviation_um": one["sigma_um"]}
             row |= {"residual_um": one["residual_um"], "is_outlier": int(one["is_outlier"])}
@@ -136,9 +138,13 @@ def _fixes_table(found: Findings) -> Table:
     return Table(_FIXES, rows)
 
 
-def panel_table(mirror: Mirror, result: SurveyResult) -> Table:
+def _list(numbers: Iterable[int]) -> str:
+    return " ".join(map(str, numbers))
+
+
+def panel_table(mirror: Mirror, panels: Sequence[PanelResult]) -> Table:
     """Position and tilt of each determined panel, and the turns of its adjusters."""
-    names = result.panels[0].adjusters if result.panels else ()
+    names = panels[0].adjusters if panels else ()
     columns = {
         **_PLACE,
         "points": "measured points",
@@ -156,9 +162,9 @@ def panel_table(mirror: Mirror, result: SurveyResult) -> Table:
         "sigma_worst_corner_um": _SIGMA,
     }
     rows: list[dict[str, object]] = []
-    for panel in result.panels:
+    for panel in panels:
         data, corner_um = panel_data(panel), [round(1e6 * value, 4) for value in worst_corner(mirror, panel)]
-        data["outliers"] = " ".join(map(str, data["outliers"]))
+        data["outliers"] = _list(data["outliers"])
         data["is_bent"] = int(panel.shape is not None and panel.shape.is_significant)
         data |= zip([f"sigma_{name}" for name in _FIT], data["sigma"], strict=True)
         data |= zip([f"{name}_um" for name in names], data["adjusters_um"], strict=True)
@@ -168,10 +174,19 @@ def panel_table(mirror: Mirror, result: SurveyResult) -> Table:
     return Table(columns, rows)
 
 
-def _moves_table(mirror: Mirror, result: SurveyResult) -> Table:
+def all_panels_table(found: Findings) -> Table:
+    """Every panel that has measured points; one that they do not determine has its place and their number."""
+    result = found.alignment
+    table = panel_table(found.record.mirror, () if result is None else result.panels)
+    others = () if result is None else result.undetermined
+    return Table(table.columns, [*table.rows, *({**one.panel._asdict(), "points": one.points} for one in others)])
+
+
+def moves_table(found: Findings) -> Table:
+    """Every adjuster of each determined panel."""
     rows = []
-    for panel in result.panels:
-        data, (_, places) = panel_data(panel), adjuster_places(mirror, panel.panel)
+    for panel in () if found.alignment is None else found.alignment.panels:
+        data, (_, places) = panel_data(panel), adjuster_places(found.record.mirror, panel.panel)
         moves = zip(panel.adjusters, places.tolist(), data["adjusters_um"], data["adjusters_sigma_um"], strict=True)
         for name, (x_m, y_m), move, sigma in moves:
             row = {**panel.panel._asdict(), "adjuster": name, "x_m": round(x_m, 6), "y_m": round(y_m, 6)}

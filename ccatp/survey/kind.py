@@ -22,4 +22,5 @@ SURVEY = MissionKind(
     stand_in=Part("ccatp.dataloop:survey_stand_in"),
     page=Part("ccatp.report.dashboard.survey_page:survey_page"),
     report=Part("ccatp.report.run_page:survey_report"),
+    analysis=Part("ccatp.analysis.survey:open_survey"),
 )
