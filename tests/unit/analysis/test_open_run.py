@@ -13,6 +13,7 @@ from ccatp.analysis.run import Run
 from ccatp.analysis.survey import SurveyRun
 from ccatp.analysis.table import Table
 from ccatp.beacons.analysis import BeaconRun
+from ccatp.core import PanelId
 from ccatp.daemon.operator.alarms import ALARMS_FILE
 from ccatp.records.run_reader import RunReadError, open_recordings
 from tests.unit.reporting.recorded import FRAMES, OFF_M, record, record_beacons
@@ -50,7 +51,7 @@ def test_points_fixes_panels_and_moves_of_a_survey(survey: SurveyRun) -> None:
     (panel,) = survey.panels
     injected = survey.findings.record.injected
     assert injected is not None
-    piston_m, tip_rad, _ = injected[(int(panel["row"]), int(panel["col"]))]
+    piston_m, tip_rad, _ = injected[PanelId(int(panel["row"]), int(panel["col"]))]
     assert abs(panel["piston_um"] - 1e6 * piston_m) < 5.0 * panel["sigma_piston_um"]
     assert abs(panel["tip_urad"] - 1e6 * tip_rad) < 5.0 * panel["sigma_tip_urad"]
     moves = survey.adjuster_moves
