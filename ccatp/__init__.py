@@ -1,15 +1,15 @@
 """Robot-controller daemon that surveys telescope mirrors with a laser-tracked puck.
 
-For analysis in Python: ``open_run`` opens the directory of a run. What it needs is imported when it is used; its type
-stands in the stub beside this file.
+For analysis in Python: ``open_run`` opens the directory of a run, ``simulate`` simulates a survey in this process. What
+they need is imported when they are used; their types stand in the stub beside this file.
 """
 
 from typing import Any
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "open_run"]
+__all__ = ["__version__", "open_run", "simulate"]
 
-_PLACES = {"open_run": "ccatp.analysis.run"}
+_PLACES = {"open_run": "ccatp.analysis.run", "simulate": "ccatp.analysis.simulation"}
 
 
 def __getattr__(name: str) -> Any:

@@ -13,13 +13,14 @@ from ccatp.records.recorder import TELEMETRY, recordings
 from ccatp.records.run_reader import RecordedFrame, RunReadError, open_recordings
 from ccatp.report.record import RunFiles, kind_of_run
 
-_ALARMS = {
+ALARM_COLUMNS = {
     "name": "name of the condition, see docs/alarms.md",
     "severity": "the highest while it was active",
     "cause": "the text for operators",
     "raised_utc": "when it was raised",
     "raised_t_s": "the same by the robot's clock",
     "ended_utc": "when it ended; empty while it is active",
+    "ended_t_s": "the same by the robot's clock",
     "acknowledged_utc": "when it was acknowledged; empty if it was not",
     "acknowledged_by": "by whom",
 }
@@ -101,7 +102,7 @@ def alarm_table(run_dir: Path) -> Table:
         if event.event == "raised":
             row |= {"severity": event.severity, "cause": event.cause}
         elif event.event == "ended":
-            row["ended_utc"] = event.utc
+            row |= {"ended_utc": event.utc, "ended_t_s": event.t_s}
         else:
             row |= {"acknowledged_utc": event.utc, "acknowledged_by": event.by}
-    return table_of_records(_ALARMS, rows)
+    return table_of_records(ALARM_COLUMNS, rows)

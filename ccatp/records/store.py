@@ -25,6 +25,7 @@ from queue import SimpleQueue
 from typing import Any, NamedTuple, Self
 
 from ccatp.config.files import sync_folder
+from ccatp.config.models import PanelsConfig
 from ccatp.core import DeckPose, Fix, Measured, PointId
 
 SCHEMA_VERSION = 2
@@ -109,6 +110,12 @@ class StoredPoint(NamedTuple):
     status: str = "planned"  # or measured, or skipped
     t_s: float | None = None  # when that happened
     fix_id: int | None = None
+
+
+def planned_point(point: PointId, grid: PanelsConfig) -> StoredPoint:
+    """A point that is to be measured, with its target on the grid of a panel."""
+    row, column = divmod(point.point - 1, len(grid.points_x_mm))
+    return StoredPoint(point, 1e-3 * grid.points_x_mm[column], 1e-3 * grid.points_y_mm[row])
 
 
 class StoredSurvey(NamedTuple):

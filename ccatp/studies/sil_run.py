@@ -32,7 +32,7 @@ from ccatp.mirror.fix_judgement import FixJudge
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.mirror.panel_alignment import fit_panels
-from ccatp.records.run_reader import TraceBuilder
+from ccatp.records.run_reader import Trace, TraceBuilder, trace_of_truth
 from ccatp.records.summary import PanelFits, SummaryBuilder
 from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
@@ -105,10 +105,18 @@ class SilTrace:
         at = _TRUTH_COLUMNS * (seq - int(self._truth[0]))
         return self._truth[at : at + _TRUTH_COLUMNS]
 
+    def estimates(self) -> Trace:
+        """The estimates of all frames."""
+        return self._estimates.build(self._mirror)
+
+    def truth(self) -> Trace:
+        """The truth of all frames."""
+        return trace_of_truth(np.array(self._truth))
+
     def join(self) -> FloatArray:
         """Give everything to the summary; the rows of ``SilResult.track``."""
         truth = np.array(self._truth).reshape(-1, _TRUTH_COLUMNS)
-        seqs, times_s, pose, heights_m, _ = self._estimates.build(self._mirror)
+        seqs, times_s, pose, heights_m, _ = self.estimates()
         estimates = np.column_stack([seqs, times_s, pose, pose[:, :2], heights_m])
         for first in range(0, len(truth), _BATCH):
             batch = truth[first : first + _BATCH]
@@ -173,6 +181,11 @@ class SilLaser:
         if not is_too_far:
             self._fixes.append(Measured(point, fix))
         return is_too_far
+
+    @property
+    def measured(self) -> tuple[Measured, ...]:
+        """The fixes that count."""
+        return tuple(self._fixes)
 
     def panel_fits(self) -> PanelFits:
         """Of the fixes that count; see ``fit_panels``."""

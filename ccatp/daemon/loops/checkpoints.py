@@ -11,7 +11,7 @@ from ccatp.daemon.supervision.run_dir import read_run_id
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.checkpoint import AT_BASE, CHECKPOINT_FILE, CheckpointError, read_checkpoint
-from ccatp.records.store import MissionStore, StoredPoint, StoreError
+from ccatp.records.store import MissionStore, StoreError, planned_point
 from ccatp.survey.composition import Checkpoint, SurveyParts, assemble, take_over
 from ccatp.survey.events import EmergencyKnown, Pause, TakenOver
 from ccatp.survey.planning.route import ORDERS
@@ -67,10 +67,6 @@ def _open_store(cfg: Config, args: ProcessArgs, mirror: str, points: Sequence[Po
     path, run_id = args.run_dir / "mission.sqlite", read_run_id(args.run_dir)
     if args.is_resuming or (args.is_restarted and path.exists()):
         return MissionStore.open(path, mirror=mirror, run_id=run_id)
-    grid = cfg.mirror.panels
-    planned = []
-    for point in points:
-        row, column = divmod(point.point - 1, len(grid.points_x_mm))
-        planned.append(StoredPoint(point, 1e-3 * grid.points_x_mm[column], 1e-3 * grid.points_y_mm[row]))
+    planned = [planned_point(point, cfg.mirror.panels) for point in points]
     text = (args.run_dir / "config.toml").read_text(encoding="utf-8")
     return MissionStore.create(path, mirror=mirror, seed=cfg.run.seed, config_toml=text, points=planned, run_id=run_id)

@@ -16,7 +16,7 @@ from ccatp.beacons.analysis import BeaconRun
 from ccatp.core import PanelId
 from ccatp.daemon.operator.alarms import ALARMS_FILE
 from ccatp.records.run_reader import RunReadError, open_recordings
-from tests.unit.reporting.recorded import FRAMES, OFF_M, record, record_beacons
+from tests.support.recorded import FRAMES, OFF_M, record, record_beacons
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,60 @@
+"""A survey that is simulated in this process has the tables of a recorded one."""
+
+import numpy as np
+import pytest
+
+import ccatp
+from ccatp.analysis.survey import SurveyRun
+from ccatp.errors import ConfigError
+from ccatp.studies.sil_run import rehearse
+from tests.support.scenario import config_of
+
+HARD = {"mirror": "fyst-m2", "seed": 4, "world": "hard"}
+
+
+@pytest.fixture(scope="module")
+def run() -> SurveyRun:
+    return ccatp.simulate(**HARD, panels=1)  # type: ignore[arg-type]
+
+
+def test_it_is_the_survey_of_its_configuration(run: SurveyRun) -> None:
+    result = rehearse(config_of("fyst-m2", run__seed=4, run__world="hard", run__panels=1))
+    track = run.track()
+    columns = ("true_x_m", "true_y_m", "true_heading_rad", "x_m", "y_m", "heading_rad")
+    assert np.array_equal(np.column_stack([track[name] for name in columns]), result.track[:, 1:])
+    assert run.summary == result.summary
+    assert run.findings.outcome.text == "complete"
+
+
+def test_points_panels_and_samples(run: SurveyRun) -> None:
+    assert list(run.points["status"]) == ["measured"] * 9
+    assert run.points["first_arrival_mm"].max() < 10.0  # the requirement
+    assert run.summary is not None
+    assert 1e-3 * run.points["first_arrival_mm"].max() < run.summary["arrival_error"]["max_mm"] * 1e-3 + 1e-9
+    (panel,) = run.panels
+    injected = run.findings.record.injected
+    assert injected is not None
+    (truth,) = [injected[one] for one in injected if one == (panel["row"], panel["col"])]
+    assert abs(panel["piston_um"] - 1e6 * truth[0]) < 5.0 * panel["sigma_piston_um"]
+    imu, track = run.samples("imu"), run.track()
+    # The mean angular rate by the gyroscope is that of the true heading; its bias is below 0.01 rad/s.
+    turned_rad = np.unwrap(track["true_heading_rad"])[[0, -1]]
+    assert imu["wz_rad_s"].mean() == pytest.approx(np.diff(turned_rad)[0] / np.ptp(track["t_s"]), abs=0.01)
+
+
+def test_a_fault_plan_shows_in_the_alarms(tmp_path_factory: pytest.TempPathFactory) -> None:
+    plan = tmp_path_factory.mktemp("plan") / "plan.toml"
+    plan.write_text('[[fault]]\nkind = "silent"\nat_s = 70.0\nfor_s = 1.0\nsensors = ["encoders"]\n')
+    run = ccatp.simulate(**HARD, panels=1, faults=plan, keep_samples=False)  # type: ignore[arg-type]
+    (alarm,) = run.alarms[run.alarms["name"] == "encoders_stale"]
+    assert 70.0 < alarm["raised_t_s"] < 70.5
+    assert alarm["ended_t_s"] > alarm["raised_t_s"]
+    with pytest.raises(ValueError, match="this simulation kept no samples: simulate with keep_samples=True"):
+        run.samples("imu")
+
+
+def test_a_value_that_cannot_be_used_is_one_line() -> None:
+    with pytest.raises(ConfigError, match=r"run\.mirror: .*fyst-m9"):
+        ccatp.simulate(mirror="fyst-m9")
+    with pytest.raises(ConfigError, match="no_such_key"):
+        ccatp.simulate(settings={"run.no_such_key": 1})
