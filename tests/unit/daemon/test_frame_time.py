@@ -6,7 +6,8 @@ from typing import Any, cast
 
 import pytest
 
-from ccatp.conditions import FRAME_LATE, FRAMES_OLD, LASER_NOT_READY, NO_FRAME_FOR, OPERATOR, Condition
+from ccatp.conditions import Condition
+from ccatp.conditions.mission import FRAME_LATE, FRAMES_OLD, LASER_NOT_READY, NO_FRAME_FOR, OPERATOR
 from ccatp.config.load import load_config
 from ccatp.core import Cause
 from ccatp.daemon.loops.frame_lateness import LatenessStatistics
@@ -14,10 +15,33 @@ from ccatp.daemon.loops.frame_time import DriveSender, LockstepTime, RealTime
 from ccatp.daemon.loops.mission_runner import STILL, DriveCommand, LoopLimits, MissionRunner
 from ccatp.daemon.loops.pauses import PauseWatch
 from ccatp.daemon.loops.robot_session import RobotSession
-from ccatp.survey.events import Fault, Interrupted, MissionState, SurveyInput
-from ccatp.survey.state import Hold, HoldState
+from ccatp.survey.engagement import EngagedMission, Engagement, EngagementRules, Held, Kind, Paused, Phase
+from ccatp.survey.events import Fault, Mode, SurveyInput
 
 MOVING = DriveCommand(1.0, 0.5)
+
+
+class Driving(Phase, frozen=True, tag=True):
+    kind, shown = Kind.WORK, Mode.DRIVING
+
+
+class Rules(EngagementRules[Engagement]):
+    rows = ()
+
+
+class Mission(EngagedMission[Engagement]):
+    """Drives; keeps the events that it was given."""
+
+    def __init__(self, events: list[SurveyInput]) -> None:
+        super().__init__(Rules(), Engagement(Driving()))
+        self._events = events
+
+    def handle(self, event: SurveyInput) -> str | None:
+        self._events.append(event)
+        return super().handle(event)
+
+    def enter(self, phase: Phase, cause: Cause) -> None:
+        self._state = Engagement(phase, cause)
 
 
 class Rig:
@@ -31,7 +55,7 @@ class Rig:
         self.events: list[SurveyInput] = []
         self.gaps = 0
         self.said: list[str] = []
-        self.mission: Any = SimpleNamespace(state=HoldState(mode=MissionState.DRIVING), handle=self._handle)
+        self.mission = Mission(self.events)
         telemetry = SimpleNamespace(notify_operator=lambda level, text: self.said.append(f"{level}: {text}"))
         self.stand_in = SimpleNamespace(
             is_busy=True, is_at_rest=True, mission=self.mission, telemetry=telemetry, on_tracking_gap=self._note_gap
@@ -46,13 +70,8 @@ class Rig:
         self.drives.take(seq)
         return seq
 
-    def hold(self, cause: Cause, *, by_hand: bool = False) -> None:
-        self.mission.state = HoldState(mode=MissionState.HELD, cause=cause, hold=Hold(by_hand=by_hand))
-
-    def _handle(self, event: SurveyInput) -> None:
-        self.events.append(event)
-        if isinstance(event, Interrupted) and self.mission.state.mode is not MissionState.HELD:
-            self.hold(event.cause)
+    def hold(self, cause: Cause) -> None:
+        self.mission.enter(Held(), cause)
 
     def _note_gap(self) -> None:
         self.gaps += 1
@@ -61,6 +80,11 @@ class Rig:
 @pytest.fixture
 def rig() -> Rig:
     return Rig()
+
+
+def pause_watch(rig: Rig) -> PauseWatch:
+    """A pause needs a fix after 10 s, and is a fault after 30 s."""
+    return PauseWatch(rig.runner, LoopLimits(0.1, hold_s=30.0), load_config(None, {"health.pause_limit_s": 10.0}))
 
 
 # -- lockstep ----------------------------------------------------------------------------------------------------------
@@ -85,7 +109,7 @@ def test_in_lockstep_the_answer_of_a_standing_robot_waits_for_the_measurement(ri
 def test_in_lockstep_a_pause_stops_time_once_the_robot_is_at_rest(rig: Rig) -> None:
     lockstep = LockstepTime(rig.runner, rig.drives)
     rig.stand_in.is_busy = False
-    rig.hold(OPERATOR.because(), by_hand=True)
+    rig.mission.enter(Paused(), OPERATOR.cause())
     rig.stand_in.is_at_rest = False
     lockstep.answer(rig.frame(1), STILL)
     assert rig.acks == [1]
@@ -101,7 +125,7 @@ def test_in_lockstep_a_pause_stops_time_once_the_robot_is_at_rest(rig: Rig) -> N
 
 def test_in_real_time_no_answer_is_withheld_and_a_hold_is_sent(rig: Rig) -> None:
     cfg = load_config()
-    pauses = PauseWatch(rig.runner, LoopLimits(0.1, 10.0, 30.0))
+    pauses = pause_watch(rig)
     real_time = RealTime(rig.runner, rig.drives, pauses, LatenessStatistics(0.02), limits=cfg.robot)
     real_time.answer(rig.frame(1), STILL)
     real_time.release()
@@ -124,7 +148,7 @@ def test_a_late_frame_is_planned_without_a_verdict_and_pauses_the_mission(
     rig.stand_in.plan = plan
     logged: list[dict[str, Any]] = []
     rig.stand_in.telemetry.log = SimpleNamespace(warning=lambda _, **fields: logged.append(fields))
-    pauses = PauseWatch(rig.runner, LoopLimits(0.1, 10.0, 30.0))
+    pauses = pause_watch(rig)
     real_time = RealTime(rig.runner, rig.drives, pauses, LatenessStatistics(0.02), limits=robot)
     now_s = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
@@ -144,7 +168,7 @@ def test_a_late_frame_is_planned_without_a_verdict_and_pauses_the_mission(
 
 
 def test_a_pause_needs_a_fix_after_its_first_limit_and_is_a_fault_after_its_second(rig: Rig) -> None:
-    pauses = PauseWatch(rig.runner, LoopLimits(0.1, pause_s=10.0, hold_s=30.0))
+    pauses = pause_watch(rig)
     assert pauses.interrupt(FRAMES_OLD, late_ms=300.0, limit_ms=250.0)
     assert rig.mission.state.cause.condition == FRAMES_OLD.name
     gaps = []
@@ -163,8 +187,8 @@ def test_a_pause_needs_a_fix_after_its_first_limit_and_is_a_fault_after_its_seco
 def test_the_time_counts_neither_in_lockstep_nor_for_a_cause_that_does_not_escalate_here(
     rig: Rig, row: Condition, counts: bool
 ) -> None:
-    pauses = PauseWatch(rig.runner, LoopLimits(0.1, pause_s=10.0, hold_s=30.0))
-    rig.hold(row.because())
+    pauses = pause_watch(rig)
+    rig.hold(row.cause())
     for now_s in (0.0, 50.0, 100.0):
         pauses.escalate(now_s, counts=counts)
     assert rig.gaps == 0
@@ -172,10 +196,10 @@ def test_the_time_counts_neither_in_lockstep_nor_for_a_cause_that_does_not_escal
 
 
 def test_another_cause_of_the_main_loop_replaces_the_one_of_a_pause_and_no_other(rig: Rig) -> None:
-    pauses = PauseWatch(rig.runner, LoopLimits(0.1, pause_s=10.0, hold_s=30.0))
+    pauses = pause_watch(rig)
     assert pauses.interrupt(FRAME_LATE, late_ms=200.0, limit_ms=100.0)
     assert pauses.interrupt(NO_FRAME_FOR, age_s=0.3)
     assert rig.mission.state.cause.condition == NO_FRAME_FOR.name
-    rig.hold(OPERATOR.because())
+    rig.mission.enter(Paused(), OPERATOR.cause())
     assert not pauses.interrupt(NO_FRAME_FOR, age_s=0.3)
     assert rig.mission.state.cause.condition == OPERATOR.name
