@@ -1,7 +1,6 @@
 """Recorded sets with ground truth, read beside the checkout: what the estimators make of them."""
 
 import time
-from pathlib import Path
 
 import pytest
 
@@ -11,9 +10,10 @@ from ccatp.beacons.estimation.batch_smoother import smooth
 from ccatp.beacons.estimation.evaluation import TrackEvaluation, judge, result_data
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.studies.recordings import estimate, shipped_window
+from tests.support.scenario import RADIO_DATA
 
 PLAZA2_S = 409.523  # how long it takes
-DATA = Path(__file__).parents[3] / "shared" / "data" / "radio"
+DATA = RADIO_DATA
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"the recorded radio data are not at {DATA}")
 
 

@@ -5,6 +5,7 @@ import socket
 from collections.abc import Callable
 from functools import cache
 from math import sqrt
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,8 @@ from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.robot import Robot
 
+# Recorded radio data are no part of the checkout; tests that read them are skipped where they are not beside it.
+RADIO_DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "radio"
 MIRRORS = tuple(available("mirror"))
 
 

@@ -34,6 +34,7 @@ from ccatp.studies.sil_run import SilRun, SilTrace
 from ccatp.studies.survey_studies import GROUPS, SENSITIVITY, TIME, combine_filters
 from ccatp.survey.composition import assemble
 from ccatp.survey.events import Pause
+from tests.support.scenario import RADIO_DATA
 from tests.support.sim_survey import plan_of
 
 SIGMA_M, SIGMA_RAD = 1e-3, 2e-3
@@ -342,7 +343,7 @@ def test_frames_leave_nothing_behind(is_paused: bool, monkeypatch: pytest.Monkey
 
 CAMPAIGNS = {name: study for name in STUDIES if isinstance(study := find_study(name), Study)}
 ONE_PANEL_ARGS = ("--panels", "1", "--set", "mission.calibration_length_m=0")  # a mission of a minute
-RECORDINGS = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "radio"
+RECORDINGS = RADIO_DATA
 FEW_STEPS = ("--set", "run.steps=300")
 
 # Choices of cells, further arguments, and the stems of all figures.

@@ -15,6 +15,7 @@ from ccatp.beacons.studies.gtsam_peer import PeerError, PeerGaveUp, run_gtsam
 from ccatp.cli import main
 from ccatp.filters.base import FilterDiverged
 from tests.support.command import answered, printed
+from tests.support.scenario import RADIO_DATA
 from tests.unit.beacons.datasets.sets import (
     BEACONS,
     csv_lines,
@@ -118,7 +119,7 @@ def test_an_estimator_that_finds_nothing(
     assert f"mine: ekf-slam finds no finite map for these data ({error})" in capsys.readouterr().err.splitlines()[-1]
 
 
-XBEE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "radio" / "xbee_rssi"
+XBEE = RADIO_DATA / "xbee_rssi"
 needs_xbee = pytest.mark.skipif(not XBEE.is_dir(), reason="the XBee sheets are not beside the checkout")
 CORNERS = ("--beacon", "A=0,0", "--beacon", "B=0,4", "--beacon", "C=4,0")
 

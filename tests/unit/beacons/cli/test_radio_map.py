@@ -12,9 +12,10 @@ import pytest
 
 from ccatp.cli import main
 from tests.support.command import answered, printed, refused
+from tests.support.scenario import RADIO_DATA
 from tests.unit.beacons.cricket.fields import ALL, HEADS, FloatArray
 
-SESSION = Path(__file__).parents[2].parent / "shared" / "data" / "radio" / "uwb_planar"
+SESSION = RADIO_DATA / "uwb_planar"
 METHODS = ("batch", "ekf")
 CONTRACT = {"rms_m", "crlb_m", "rank_deficiency", "fold_over_risk", "phase1_rms_m", "iterations"}
 
