@@ -79,7 +79,7 @@ class Driving:
         rig.time.sleep(1.0)
         self.robot = OnboardRobot(CFG, self.rig.hardware)
         self._rates = [0.0, 0.0]
-        self.run(2.0)
+        self.run(0.5)  # eight time constants of the wheels
         assert self._rates == pytest.approx(RATES, abs=0.05)  # 2 % of the set points
         assert not self.robot.rules.is_held
         assert not self.robot.faults
