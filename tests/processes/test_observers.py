@@ -34,7 +34,7 @@ from ccatp.records.recorder import iter_messages
 from ccatp.studies.sil_run import rehearse
 from tests.docs.test_docs import blocks
 from tests.processes.conftest import Start
-from tests.support.runs import NO_CALIBRATION, Run
+from tests.support.runs import NO_CALIBRATION, NO_REPORT, Run
 from tools.generated_docs import DOCS, ROOT
 
 WITH_PAGE = ("--set", "dashboard.enabled=true", "--set", "dashboard.port=0")
@@ -202,7 +202,7 @@ def run_example(command: str) -> tuple[int, str]:
     if name == "ccatp" and words[0] != "run":
         with redirect_stdout(StringIO()) as printed:
             return main(words), printed.getvalue()
-    env = os.environ | ({"MPLBACKEND": "none"} if name == "ccatp" else {})  # of its report nothing is shown
+    env = os.environ | (NO_REPORT if name == "ccatp" else {})
     done = subprocess.run(command, shell=True, env=env, capture_output=True, text=True, timeout=300, check=False)
     return done.returncode, done.stdout
 

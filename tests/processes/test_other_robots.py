@@ -1,6 +1,7 @@
 """The on-board program in a process of its own, and a robot and a laser system that share no code with us."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.support import foreign_robot
+from tests.support.runs import NO_REPORT
 from tools.onboard_reactions import TRIALS, Program, driving, measure
 
 
@@ -59,7 +61,8 @@ def survey_of(options: str, tmp_path: Path, runtime_dir: Path) -> tuple[subproce
             config.write_text(CONFIG.format(**json.loads(robot.stdout.readline())))
             survey = [sys.executable, "-m", "ccatp", "run", "--config", str(config), "--panels", "1", "--json"]
             survey += ["--run-dir", str(tmp_path / "run"), "--runtime-dir", str(runtime_dir)]
-            run = subprocess.run(survey, capture_output=True, text=True, timeout=600.0, check=False)
+            env = os.environ | NO_REPORT
+            run = subprocess.run(survey, env=env, capture_output=True, text=True, timeout=600.0, check=False)
         finally:
             robot.terminate()
         return run, json.loads(robot.stdout.read())

@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 from tests.processes.conftest import Start
-from tests.support.runs import NO_CALIBRATION, until
+from tests.support.runs import NO_CALIBRATION, NO_REPORT, until
 
 WATCHDOG_S = 2.0
 DEADLINE_S = 60.0
@@ -135,7 +135,7 @@ def test_a_full_device_as_output_and_few_open_files_at_first_do_not_matter(runti
     with Path("/dev/full").open("wb") as full:
         run = subprocess.run(
             command(runtime_dir, tmp_path / "run"), preexec_fn=lambda: limited(24, 4096), stdout=full,
-            stderr=subprocess.PIPE, timeout=PATIENCE_S, check=False,
+            stderr=subprocess.PIPE, env=os.environ | NO_REPORT, timeout=PATIENCE_S, check=False,
         )  # fmt: skip
     assert (run.returncode, logged_status(tmp_path / "run")) == (0, 0)
     assert b"warning: standard output cannot be written: No space left on device; see summary.json\n" in run.stderr

@@ -28,6 +28,8 @@ NO_CALIBRATION = ("--set", "mission.calibration_length_m=0")
 FREE_PORTS = ("--set", "sim.robot.port=0", "--set", "sim.etalon.port=0", "--set", "dashboard.enabled=false")
 MODULES = {process.name: process.module for process in PROCESSES}
 DEADLINE_S = 60.0
+# Of a run whose report nobody reads: to draw it takes seconds.
+NO_REPORT = {"MPLBACKEND": "none"}
 # Two panels in the world with slip and delays.
 RECORDED = ("--panels", "2", "--world", "hard", "--filter", "ekf", "--json", *NO_CALIBRATION)
 
@@ -45,7 +47,7 @@ class Run:
         self.run_dir, self.runtime_dir = run_dir, runtime_dir
         command = [sys.executable, "-m", "ccatp", "run", "--sim", "--run-dir", str(run_dir)]
         command += ["--runtime-dir", str(runtime_dir), *self.free_ports, *args]
-        env = os.environ | ({} if has_report else {"MPLBACKEND": "none"})
+        env = os.environ | ({} if has_report else NO_REPORT)
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env)
         self.stdout = self.stderr = ""
 
@@ -199,20 +201,30 @@ class RecordedRun(Run):
 
 def record_once(factory: pytest.TempPathFactory) -> RecordedRun:
     """The run with the options `RECORDED`: made by the first worker that wants it, read by all others."""
+
+    def make(folder: Path) -> None:
+        with (
+            tempfile.TemporaryDirectory(prefix="ccatp-") as sockets,
+            Run(folder / "run", Path(sockets), *RECORDED, has_report=True) as run,
+        ):
+            assert run.wait(300.0) == 0, run.stderr
+        (folder / "stdout").write_text(run.stdout)
+        (folder / "stderr").write_text(run.stderr)
+
+    return RecordedRun(made_once(factory, "recorded", make))
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder of the session, filled by the first worker that wants it; the others wait, and read from it."""
     root = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         root = root.parent
-    folder = root / "recorded"
-    folder.mkdir(exist_ok=True)
-    with (folder / "lock").open("w") as lock:
+    folder = root / name
+    with (root / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (folder / "stderr").exists():
-            shutil.rmtree(folder / "run", ignore_errors=True)  # of an attempt that failed
-            with (
-                tempfile.TemporaryDirectory(prefix="ccatp-") as sockets,
-                Run(folder / "run", Path(sockets), *RECORDED, has_report=True) as run,
-            ):
-                assert run.wait(300.0) == 0, run.stderr
-            (folder / "stdout").write_text(run.stdout)
-            (folder / "stderr").write_text(run.stderr)
-    return RecordedRun(folder)
+        if not (folder / "is_whole").exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of an attempt that failed
+            folder.mkdir()
+            make(folder)
+            (folder / "is_whole").touch()
+    return folder

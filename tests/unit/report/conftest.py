@@ -8,14 +8,15 @@ import pytest
 
 from tests.support.pages import drawn, undrawn
 from tests.support.recorded import record
+from tests.support.runs import made_once
 
 __all__ = ["drawn", "undrawn"]
 
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One panel in a hard world, complete. Not to be written to."""
-    return record(tmp_path_factory.mktemp("recorded") / "tonight")
+    """One panel in a hard world, complete; recorded once per session for all workers. Not to be written to."""
+    return made_once(tmp_path_factory, "surveyed", lambda folder: record(folder / "tonight")) / "tonight"
 
 
 @pytest.fixture

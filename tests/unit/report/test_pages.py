@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -37,8 +38,11 @@ ALL = [
 
 
 @pytest.mark.usefixtures("drawn")
-def test_the_page_of_a_whole_run(recorded: Path) -> None:
-    page = run_page(findings_of(read_record(recorded)))
+def test_the_page_of_a_whole_run(recorded: Path, run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    figures = run_dir.parent / "figures" / "deep"
+    reported = answered(capsys, "report", run_dir, "--figures", figures)
+    the_command_says_what_it_wrote(reported, run_dir, figures)
+    page = (run_dir / "report.html").read_text(encoding="utf-8")
     markup = Markup(page)
     assert markup.outside == []
     assert markup.anchors == ALL
@@ -357,10 +361,7 @@ def test_a_page_stays_small_however_much_went_wrong(run_dir: Path) -> None:
 # -- the commands -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("drawn")
-def test_the_command(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    figures = tmp_path / "figures" / "deep"
-    reported = answered(capsys, "report", run_dir, "--figures", figures)
+def the_command_says_what_it_wrote(reported: dict[str, Any], run_dir: Path, figures: Path) -> None:
     assert reported["report"] == str(run_dir / "report.html")
     assert (run_dir / "report.html").stat().st_size > 100_000
     assert not list(run_dir.glob("*.new"))

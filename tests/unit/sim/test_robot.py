@@ -101,7 +101,8 @@ def test_a_sensor_that_is_off_at_the_rim_is_beyond_it_wherever_the_panel_ends() 
         robot = boot(cfg, mirror, seed)
         is_off, clearance_m = False, 1.0
         while not (clearance_m < 0.0 or (is_off and clearance_m < 5e-3)):
-            drive(robot, -0.3, -0.3, 1)
+            rate_rad_s = -3.0 if clearance_m > 0.02 else -0.3
+            drive(robot, rate_rad_s, rate_rad_s, 1)
             is_off = any(0 in sample[1:] for sample in sensors_of(robot).edge)
             clearance_m = robot.world.truth_row(robot.seq, robot.t_s)[8]
         assert clearance_m < 0.0
