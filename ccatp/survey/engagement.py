@@ -402,7 +402,9 @@ class EngagementRules(Generic[S]):
                 return self.pause(s, cause), None
             case Abort(cause):
                 return self.abort(s, cause), None
-        return self.finish(s, SurveyOutcome.STOPPED), None
+            case StopHere():
+                return self.finish(s, SurveyOutcome.STOPPED), None
+        raise TypeError(f"a mission has no reaction to {event!r}")
 
     # -- verdicts -----------------------------------------------------------------------------------------------------
 

@@ -124,7 +124,7 @@ class Survey(EngagementRules[SurveyState]):
             is_at_edge = verdict is not None and verdict.code is EventCode.NEAR_EDGE
             s = replace(s, pose=Located(motion.t_s + _NOTICED_S) if is_at_edge else Located())
         s = self.react(s, motion, verdict)
-        command = HOLD_POSITION
+        command = HOLD_POSITION  # also of a mission that is ready, held, paused or over
         if motion.t_s >= s.stands_until_s:
             match s.phase:
                 case Travel():
