@@ -59,8 +59,8 @@ class Run:
 def open_run(path: str | os.PathLike[str]) -> Run:
     """Open the directory of a run; nothing in it is changed.
 
-    Its type follows from the kind of mission: ``SurveyRun``, or ``ccatp.beacons.analysis.BeaconRun``. Raises
-    RunReadError: no run is there, or none that this version can read; ConfigError: its configuration cannot be used.
+    Its type is that of the kind of mission: ``SurveyRun`` for a survey. Raises RunReadError: no run is there, or none
+    that this version can read; ConfigError: its configuration cannot be used.
     """
     run_dir = Path(path)
     kind = kind_of_run(run_dir)

@@ -18,6 +18,7 @@ class SampleKind(NamedTuple):
 
     names: tuple[str, ...]
     rows: Callable[[RecordedFrame], Iterable[Row]]
+    texts: tuple[str, ...] = ()  # those of the values that are texts
 
 
 def _gravity(frame: RecordedFrame) -> Iterator[Row]:
@@ -67,4 +68,4 @@ def samples(name: str, sessions: Iterable[Iterable[RecordedFrame]], kinds: Mappi
         for frame in frames
         for t_s, *values in kind.rows(frame)
     )
-    return table_of_rows(("session", "frame", "t_s", *kind.names[1:]), rows, _DESCRIPTIONS)
+    return table_of_rows(("session", "frame", "t_s", *kind.names[1:]), rows, _DESCRIPTIONS, kind.texts)

@@ -1,6 +1,6 @@
 """A table as a structured numpy array whose fields have their units in their names."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -56,20 +56,25 @@ _WHOLE = frozenset((
 ))  # fmt: skip
 _TEXTS = frozenset((
     "status", "metrology", "channels", "left_out", "outliers", "adjuster", "name", "severity", "cause", "advice",
-    "raised_utc", "ended_utc", "acknowledged_utc", "acknowledged_by", "beacon", "sender", "listener", "faults",
+    "raised_utc", "ended_utc", "acknowledged_utc", "acknowledged_by", "faults",
 ))  # fmt: skip
 
 
 def table_of_rows(
-    names: Sequence[str], rows: Iterable[Sequence[object]], descriptions: Mapping[str, str] | None = None
+    names: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    descriptions: Mapping[str, str] | None = None,
+    texts: Collection[str] = (),
 ) -> Table:
     """A table of rows, values in the order of ``names``; ``None`` is an unknown value.
 
-    Its fields have the same types whatever the rows are.
+    Its fields have the same types whatever the rows are. ``texts``: fields of texts beside those of every mission.
     """
     found = list(rows)
     columns = zip(*found, strict=True) if found else ((),) * len(names)
-    return Table({name: _column(name, column) for name, column in zip(names, columns, strict=True)}, descriptions)
+    return Table(
+        {name: _column(name, column, texts) for name, column in zip(names, columns, strict=True)}, descriptions
+    )
 
 
 def table_of_records(columns: Mapping[str, str], records: Iterable[Mapping[str, object]]) -> Table:
@@ -77,8 +82,8 @@ def table_of_records(columns: Mapping[str, str], records: Iterable[Mapping[str, 
     return table_of_rows(tuple(columns), ([record.get(name) for name in columns] for record in records), columns)
 
 
-def _column(name: str, values: Sequence[Any]) -> npt.NDArray[Any]:
-    if name in _TEXTS:
+def _column(name: str, values: Sequence[Any], texts: Collection[str]) -> npt.NDArray[Any]:
+    if name in _TEXTS or name in texts:
         return np.array(["" if value is None else str(value) for value in values], dtype=np.str_)
     if name in _WHOLE:
         return np.array(values, dtype=np.int64)

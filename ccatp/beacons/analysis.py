@@ -103,10 +103,12 @@ def _motes(frame: RecordedFrame) -> Iterator[Row]:
 SAMPLES: Mapping[str, SampleKind] = {
     **KINDS,
     "steer": SampleKind(SteerSample._fields, lambda frame: _extras(frame).steer),
-    "radio": SampleKind(RadioSample._fields, lambda frame: _extras(frame).radio),
-    "scan": SampleKind(("t_s", "beacon", "direction_rad", "rssi_dbm"), _scan),
+    "radio": SampleKind(RadioSample._fields, lambda frame: _extras(frame).radio, ("beacon",)),
+    "scan": SampleKind(("t_s", "beacon", "direction_rad", "rssi_dbm"), _scan, ("beacon",)),
     "distances": SampleKind(("t_s", "sensor", "distance_m"), _distances),
-    "motes": SampleKind(("t_s", "sender", "listener", "temperature_c", "pulse", "delay_s"), _motes),
+    "motes": SampleKind(
+        ("t_s", "sender", "listener", "temperature_c", "pulse", "delay_s"), _motes, ("sender", "listener")
+    ),
 }
 
 

@@ -8,7 +8,6 @@ PACKAGE, TESTS, TOOLS = ROOT / "ccatp", ROOT / "tests", ROOT / "tools"
 UNIT = TESTS / "unit"
 # Files of tests that are about no one module of the folder, or of those below it.
 OF_SEVERAL_MODULES = {
-    "analysis/test_open_run",
     "beacons/report/test_beacon_report", "beacons/studies/test_beacon_studies", "beacons/test_driving",
     "cli/test_cli_commands", "cli/test_refusals", "daemon/test_service", "daemon/test_telemetry",
     "beacons/cli/test_radio_map", "control/test_tracker_pid", "estimation/test_replay_buffer",
