@@ -24,7 +24,7 @@ Ten times what the noise of the encoders gives over ``health.stall_time_s``.
 
 ALMOST_AT_REST_M_S = 0.002
 ALMOST_AT_REST_RAD_S = 0.01
-"""The robot is almost at rest: told to stand and slower than this, it travels less than 0.2 mm until it stands."""
+"""The robot is almost at rest: commanded to stand and slower than this, it travels less than 0.2 mm until it stands."""
 
 NO_MOTION_M = 2e-5
 NO_MOTION_RAD = 1e-4

@@ -1,6 +1,7 @@
 """A run for analysis, of any kind of mission, and how it is opened."""
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ ALARM_COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Run:
+class Run(ABC):
     """A run: finished, in progress, killed or simulated in one process.
 
     ``summary``: the content of summary.json; ``None`` if the run did not come to its end, or not yet. ``warnings``: a
@@ -44,9 +45,9 @@ class Run:
     frames: Callable[[], Iterable[Iterable[RecordedFrame]]]  # of each session, read again by each call
     sample_kinds: Mapping[str, SampleKind]
 
+    @abstractmethod
     def track(self) -> Table:
         """Estimated and true pose of each frame."""
-        raise NotImplementedError
 
     def samples(self, name: str) -> Table:
         """Samples of the sensors by their key on the robot link, as in ``samples("imu")``.

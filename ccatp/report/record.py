@@ -135,8 +135,6 @@ def read_record(run_dir: Path) -> RunRecord:
         folder.missing.append("the simulated truth: errors are those that the laser saw")
     points, measured = _survey(folder, mirror)
     injected, _ = read_truth(run_dir, folder.warnings)
-    # Mirror and world have names of their own.
-    ours, shipped = (one.model_dump(mode="json", exclude={"mirror", "world"}) for one in (cfg, load_config()))
     return RunRecord(
         cfg=cfg,
         mirror=mirror,
@@ -144,9 +142,15 @@ def read_record(run_dir: Path) -> RunRecord:
         points=points,
         measured=measured,
         injected=injected,
-        changed=changed_keys(ours, shipped),
+        changed=changed_from_shipped(cfg),
         **folder.fields(),
     )
+
+
+def changed_from_shipped(cfg: Config) -> dict[str, tuple[object, object]]:
+    """``changed_keys`` of a survey, without mirror and world, which have names of their own."""
+    ours, shipped = (one.model_dump(mode="json", exclude={"mirror", "world"}) for one in (cfg, load_config()))
+    return changed_keys(ours, shipped)
 
 
 def kind_of_run(run_dir: Path) -> MissionKind:

@@ -32,7 +32,7 @@ from ccatp.survey.statechart import Mission, Survey
 RADIUS_TOLERANCE = 0.05
 SENSOR_TOLERANCE_M = 0.005
 
-# Modes in which the robot is told to stand.
+# Modes in which the robot is commanded to stand.
 _STANDING = (IDLE, SETTLING, MEASURING, HELD, Mode.DONE)
 # Standard deviations for a robot that stood: it may have crept, or somebody may have touched it.
 _STOOD_M, _STOOD_RAD = 0.005, 0.01

@@ -93,7 +93,7 @@ def test_the_times_are_what_they_are_called() -> None:
     assert all(one.verdict.severity is Severity.NONE for one in run.since(0.1))
 
 
-# -- the wheels are told to stand --------------------------------------------------------------------------------------
+# -- the wheels are commanded to stand ----------------------------------------------------------------------------
 
 
 # Row of the fault table, faults, when, until when they are watched, limit in time, and what is expected.

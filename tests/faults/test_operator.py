@@ -65,7 +65,7 @@ def story(config: Config, mirror: Mirror) -> Story:
 
 
 class Aborted(MeasuredSurvey):
-    """An emergency in a given state of the mission, and how long it took until the wheels were told to stand."""
+    """An emergency in a given state of the mission, and how long it took until the wheels were commanded to stand."""
 
     def __init__(self, cfg: Config, folder: Path, state: Mode, kind: str, clear_after_s: float = inf) -> None:
         super().__init__(cfg, folder)

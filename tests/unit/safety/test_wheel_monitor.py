@@ -1,4 +1,4 @@
-"""Wheels that turn though they were told to stand, and those that run down after a stall of the link."""
+"""Wheels that turn though they were commanded to stand, and those that run down after a stall of the link."""
 
 import pytest
 
