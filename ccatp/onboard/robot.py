@@ -220,11 +220,18 @@ class OnboardRobot(LinkedRobot):
         if gravity is not None:
             self._gravity = None
         frame = RobotFrame(
-            self.seq, round(t_s, 6), self._take_samples(self._imu, since_s), self._take_samples(self._enc, since_s),
-            self._take_samples(self._edge, since_s), gravity, self.fans.duty, self._soc,
-            CommandEcho(drive_seq, round(age_s, 6), round(permit_age_s, 6), is_held), faults,
-            t_s < self._slides_until_s,
-        )  # fmt: skip
+            self.seq,
+            round(t_s, 6),
+            imu=self._take_samples(self._imu, since_s),
+            enc=self._take_samples(self._enc, since_s),
+            edge=self._take_samples(self._edge, since_s),
+            gravity=gravity,
+            fans=self.fans.duty,
+            soc=self._soc,
+            cmd=CommandEcho(drive_seq, round(age_s, 6), round(permit_age_s, 6), is_held),
+            faults=faults,
+            sliding=t_s < self._slides_until_s,
+        )
         self._line = encode(frame)
         self.delivered_seq = self.seq
 

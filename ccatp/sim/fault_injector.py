@@ -331,10 +331,18 @@ class Injector:
                     record.add(t_s, is_changed=bool(rows[name]))
                     rows[name] = [(max(row[0] + record.fault.by_s, 0.0), *row[1:]) for row in rows[name]]
         _, left, right = rows["fans"][-1]
-        stamp, names = self._stamp(t_s, t_s - self._boot_s, is_frame=True), self._raised(t_s)
-        lists, charge = (rows["imu"], rows["enc"], rows["edge"]), rows["soc"][-1][1]
-        gravity = rows["gravity"][-1] if rows["gravity"] else None
-        return RobotFrame(frame.seq - self._seq_0, stamp, *lists, gravity, (left, right), charge, frame.cmd, names)
+        return RobotFrame(
+            frame.seq - self._seq_0,
+            self._stamp(t_s, t_s - self._boot_s, is_frame=True),
+            imu=rows["imu"],
+            enc=rows["enc"],
+            edge=rows["edge"],
+            gravity=rows["gravity"][-1] if rows["gravity"] else None,
+            fans=(left, right),
+            soc=rows["soc"][-1][1],
+            cmd=frame.cmd,
+            faults=self._raised(t_s),
+        )
 
     def _stamp(self, t_s: float, at_s: float, *, is_frame: bool) -> float:
         """The time stamp for ``at_s``, which counts from the boot, at the time ``t_s`` of the plan."""

@@ -131,7 +131,10 @@ class Robot(SimulatedRobot, SurveyTruth):
         is_held = is_held or self.world.is_fallen
         age_s, permit_age_s = (age_s * 1e6 + WHOLE - WHOLE) / 1e6, (permit_age_s * 1e6 + WHOLE - WHOLE) / 1e6
         cmd = CommandEcho(drive_seq, age_s, permit_age_s, is_held)
-        frame = RobotFrame(seq, t_s, imu, encoders, edges, gravity, self.fans.duty, 1.0, cmd, ())
+        frame = RobotFrame(
+            seq, t_s, imu=imu, enc=encoders, edge=edges, gravity=gravity, fans=self.fans.duty, soc=1.0, cmd=cmd,
+            faults=(),
+        )  # fmt: skip
         injector, frames = self.injector, self._frames
         frames.append(frame if injector is None else injector.sense(frame))
         self._delivered, self._line = None, b""

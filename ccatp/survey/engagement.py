@@ -5,6 +5,7 @@ The phases in which a mission works are its own: each is a value with what has a
 ``TRANSITIONS`` has every change of the kind. What a verdict means is decided by the rows of ``failsafe.py``.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from functools import partial
@@ -271,7 +272,7 @@ class Row(NamedTuple):
     react: Callable[[Any, Any, Any, Verdict], tuple[Any, bool]]
 
 
-class EngagementRules(Generic[S]):
+class EngagementRules(ABC, Generic[S]):
     """Holding, continuing and going home. ``rows``: reactions in the order of precedence.
 
     A mission says what it does when it may continue, at an edge and at reduced speed, and what follows from a pose that
@@ -364,9 +365,9 @@ class EngagementRules(Generic[S]):
         """End the mission."""
         return enter(s, Event.FINISH, Over(outcome))
 
+    @abstractmethod
     def proceed(self, s: S) -> S:
         """Change to the next task."""
-        raise NotImplementedError
 
     def lose_pose(self, s: S, *, doubts_odometry: bool = True) -> S:
         """Mark the pose as not trusted; with ``doubts_odometry`` the localizer inflates its covariance."""
@@ -378,8 +379,9 @@ class EngagementRules(Generic[S]):
         return replace(s, is_slow=is_slow)
 
     def retreat(self, s: S, frame: Any, verdict: Verdict) -> S:
-        """Leave the edge that a verdict reports; for a mission that has a row for edges."""
-        raise NotImplementedError
+        """Leave the edge that a verdict reports; a mission without a retreat holds until the edge is gone."""
+        del frame
+        return self.interrupt(s, verdict.cause)
 
     # -- events between two frames ------------------------------------------------------------------------------------
 

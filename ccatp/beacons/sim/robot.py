@@ -122,7 +122,9 @@ class BeaconRobot(SimulatedRobot):
             steer = [SteerSample(t_s, frame.wheels.steer_rad)] if self.is_steerable else []
             motes = [] if self._listener is None else self._listener.receive(t_s, self.world.pose)
             extras = replace(frame.extras, steer=steer, motes=motes)
-        line = RobotFrame(self.seq, t_s, (), wheels, (), None, (0.0, 0.0), 1.0, cmd, ())
+        line = RobotFrame(
+            self.seq, t_s, imu=(), enc=wheels, edge=(), gravity=None, fans=(0.0, 0.0), soc=1.0, cmd=cmd, faults=()
+        )
         self._line = with_extras(encode(line), extras)
 
 

@@ -28,6 +28,9 @@ class Driving(Phase, frozen=True, tag=True):
 class Rules(EngagementRules[Engagement]):
     rows = ()
 
+    def proceed(self, s: Engagement) -> Engagement:
+        return s
+
 
 class Mission(EngagedMission[Engagement]):
     """Drives; keeps the events that it was given."""
