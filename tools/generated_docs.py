@@ -27,7 +27,7 @@ from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervision.supervisor import PROCESSES
 from ccatp.links.topics import all_topics
 from ccatp.survey.failsafe import ROWS
-from tests.contract.test_conformance_broken import TABLES
+from tests.contract.broken_servers import TABLES
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
