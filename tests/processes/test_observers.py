@@ -1,6 +1,5 @@
 """Who looks at a run in real time, or speaks to it: a viewer, the check, dashboards, clients. The survey goes on."""
 
-import doctest
 import http.client
 import json
 import os
@@ -34,6 +33,7 @@ from ccatp.records.recorder import iter_messages
 from ccatp.studies.sil_run import rehearse
 from tests.docs.test_docs import blocks
 from tests.processes.conftest import Start
+from tests.support.examples import is_like
 from tests.support.runs import NO_CALIBRATION, NO_REPORT, Run
 from tools.generated_docs import DOCS, ROOT
 
@@ -152,32 +152,6 @@ def test_the_simulated_servers_are_ready(runtime_dir: Path, tmp_path: Path) -> N
 # -- the first look of the documentation: its commands print what it shows ---------------------------------------------
 
 EXAMPLE = re.compile(r"^\$ (.*)\n((?:(?!\$ ).*\n)*)", re.MULTILINE)
-SHOWN = doctest.OutputChecker()
-FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-
-
-NUMBER = re.compile(r"-?\d+\.\d+")
-
-
-def is_like(shown: str, printed: str) -> bool:
-    """Equal, or with decimals that another processor rounds otherwise: by a tenth, or two units of what is shown."""
-    if SHOWN.check_output(shown, printed, FLAGS):
-        return True
-    numbers, found = NUMBER.findall(shown), NUMBER.findall(printed)
-    return SHOWN.check_output(NUMBER.sub("...", shown), printed, FLAGS) and (
-        len(numbers) != len(found)  # some are left out by an ellipsis
-        or all(
-            abs(float(a) - float(b)) <= max(0.1 * abs(float(a)), 2.0 * 10.0 ** -len(a.partition(".")[2]))
-            for a, b in zip(numbers, found, strict=True)
-        )
-    )
-
-
-def test_decimals_may_be_those_of_another_processor_and_nothing_else_may() -> None:
-    assert is_like("mean 0.048 p99 1.634\n", "mean 0.049 p99 1.590\n")
-    assert not is_like("mean 0.048 p99 1.634\n", "mean 0.048 p99 1.134\n")
-    assert not is_like("mean 0.048\n", "median 0.048\n")
-    assert not is_like("9 of 9 points, 0.048\n", "8 of 9 points, 0.048\n")
 
 
 @pytest.fixture(scope="module")
