@@ -4,6 +4,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 NEWEST_VENV ?= .venv-newest
+RUN_VENV ?= .venv-run
 ARGS ?=
 PYTEST_ARGS ?=
 WORKERS ?= 2
@@ -20,7 +21,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 # One more than there are cores: tests of real processes wait for most of their time.
 PYTEST := $(BIN)/python -m pytest -n $$(($(WORKERS) + 1)) --dist loadgroup --no-loadscope-reorder
 
-.PHONY: help run test tests test-newest newest environment test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
+.PHONY: help run test tests test-newest newest run-newest strict-run environment test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
 .PHONY: kills mutants golden golden-quick lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
@@ -28,7 +29,8 @@ PYTEST := $(BIN)/python -m pytest -n $$(($(WORKERS) + 1)) --dist loadgroup --no-
 help:
 	@echo "make run [ARGS=...]   survey a simulated mirror: ccatp run --sim"
 	@echo "make test             lint, types, import contract, tests"
-	@echo "make test-newest      unit tests of loops and estimation and a small survey on the newest Python installed, in $(NEWEST_VENV)"
+	@echo "make run-newest       a small survey on the newest Python installed, without development tools, warnings as errors, in $(RUN_VENV)"
+	@echo "make test-newest      the same, and unit tests of loops and estimation, in $(NEWEST_VENV): before a release"
 	@echo "make test-slow        the tests that take minutes, new random examples, and a tenth of the sweep"
 	@echo "make sweep            drives over every centimetre of every rim; continues where it was stopped [SHARE=0.1 ARGS='--seed 2']"
 	@echo "make kills            random kills of processes over whole missions; continues where it was stopped [SIGNALS=2000]"
@@ -72,15 +74,26 @@ tried-in:
 		{ apt-get install -y -qq $$wanted || { apt-get update -qq && apt-get install -y -qq $$wanted; }; } >/dev/null 2>&1; } || \
 		echo "ccatp: without$$wanted, so what is tried in them is skipped; on Debian: apt install$$wanted"
 
-# In an environment of its own; the oldest Python is that of `make test` in CI.
-test-newest:
-	@pythons=$$(.ci/pythons | tail -n 2); newest=$${pythons##*[[:space:]]}; if test "$$pythons" = "$$newest"; then \
-		echo "ccatp: $${newest:-no python3.11 to 3.14} is the only supported Python here; nothing else to test on"; else \
-		$(MAKE) --no-print-directory VENV=$(NEWEST_VENV) PYTHON="$$newest" newest; fi
+# In environments of their own; the oldest Python is that of `make test` in CI.
+ON_NEWEST = pythons=$$(.ci/pythons | tail -n 2); newest=$${pythons\#\#*[[:space:]]}; if test "$$pythons" = "$$newest"; then \
+	echo "ccatp: $${newest:-no python3.11 to 3.14} is the only supported Python here; nothing else to test on"; else \
+	$(MAKE) --no-print-directory PYTHON="$$newest"
+
+test-newest: run-newest
+	@$(ON_NEWEST) VENV=$(NEWEST_VENV) newest; fi
 
 newest: $(VENV)/.installed-dev
 	$(PYTEST) $(addprefix tests/unit/,control daemon estimation filters) tests/oracle $(PYTEST_ARGS)
-	rm -rf build/newest && $(BIN)/ccatp run --sim --panels 2 --run-dir build/newest
+
+run-newest:
+	@$(ON_NEWEST) VENV=$(RUN_VENV) strict-run; fi
+
+# What needs a development tool fails. A warning is an error in every process; one that was restarted after it left a
+# warning in the log.
+strict-run: $(VENV)/.installed
+	rm -rf build/strict && PYTHONWARNINGS=error $(BIN)/ccatp run --sim --panels 2 --run-dir build/strict
+	! grep '"level": "warning"' build/strict/log.jsonl
+	test -s build/strict/report.html
 
 # What fails in one part does not keep the others from being run. A tenth of the sweep, chosen at random.
 test-slow:
@@ -179,5 +192,5 @@ lock:
 	$(UV_COMPILE) --group dev --all-extras --constraint requirements.lock --output-file requirements-dev.lock
 
 clean:
-	rm -rf $(VENV) $(NEWEST_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(NEWEST_VENV) $(RUN_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find ccatp tests tools -name __pycache__ -type d -prune -exec rm -rf {} +
