@@ -36,9 +36,10 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from math import inf
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from ccatp.config.onboard_models import DaqConfig
+from ccatp.onboard.devices.serial_line import OpenPort, SerialLine
 from ccatp.onboard.hardware import HardwareError
 
 SYNC, VERSION = b"\xa5\x5a", 1
@@ -46,37 +47,17 @@ IDENTIFY, START, STOP, IDENTITY, SAMPLES = 0x01, 0x02, 0x03, 0x81, 0x82
 HEADER, CRC, SAMPLE = struct.Struct("<2sBBBH"), struct.Struct("<H"), struct.Struct("<Iii5H")
 FULL_SCALE = 65535.0
 
-READ_BYTES = 4096
 ASK_S = 0.25  # between two requests for the identity
 SEND_S = 0.02  # time for the transmission of a frame
 ANSWER_S = 5.0  # opening the port may reset the device, whose start may take some seconds
-RETRY_S, LONGEST_RETRY_S = 0.1, 2.0  # between two attempts to open the port
-GARBAGE_BYTES = 64  # so many bytes without a valid frame are reported as a wrong baud rate
 BATTERY_S = 1.0  # time constant of the battery's voltage, over which the motors' currents average out
 
 # Of DeviceClock. SLEW: twice the largest error of a clock, 1 %, so that a remaining offset decreases.
 SETTLE_S, WINDOW_S, SLEW, JUMP_S = 0.1, 0.2, 0.02, 0.1
 
 
-class SerialPort(Protocol):
-    """A serial port that never waits. Its methods raise OSError if the device is gone."""
-
-    def read(self, size: int, /) -> bytes:
-        """The received bytes, at most ``size``."""
-
-    def write(self, data: bytes, /) -> object:
-        """Send."""
-
-    def reset_output_buffer(self) -> None:
-        """Discard the unsent bytes."""
-
-    def close(self) -> None:
-        """Release it."""
-
-
 Clock = Callable[[], float]
 Sleep = Callable[[float], object]
-OpenPort = Callable[[str, int], SerialPort]  # device file and baud rate
 
 
 class DaqSample(NamedTuple):
@@ -204,13 +185,10 @@ class Daq:
     """
 
     def __init__(self, config: DaqConfig, open_port: OpenPort, clock: Clock, sleep: Sleep) -> None:
-        self._config, self._open_port, self._now, self._sleep = config, open_port, clock, sleep
+        self._config, self._now, self._sleep = config, clock, sleep
         self._volt = config.full_scale_v / FULL_SCALE
-        self._port: SerialPort | None = None
-        self._reason = ""
-        self._retry_s, self._retry_wait_s = -inf, RETRY_S
-        self._ask_s = self._valid_s = self._sample_s = -inf
-        self._garbage = 0
+        self._line = SerialLine(config.device, config.baud, open_port)
+        self._ask_s = self._sample_s = -inf
         self._seq = 0
         self._is_started = False
         self._clock = DeviceClock()
@@ -224,7 +202,7 @@ class Daq:
         """Open the port and wait for samples. Raises HardwareError."""
         until_s = self._now() + ANSWER_S
         while not self.poll(self._now()):
-            if self._port is None or self._now() > until_s:
+            if not self._line.is_open or self._now() > until_s:
                 reason = self._why()
                 self.close()
                 raise HardwareError(f"data acquisition device: {reason}")
@@ -233,17 +211,14 @@ class Daq:
     def poll(self, now_s: float) -> list[DaqSample]:
         """Samples since the last call."""
         samples: list[DaqSample] = []
+        line = self._line
         try:
-            if self._port is None:
-                if now_s < self._retry_s:
-                    return []
-                self._port = self._open_port(self._config.device, self._config.baud)
-                self._valid_s = self._ask_s = now_s
-                self._garbage, self._is_started = 0, False
-            data = self._opened().read(READ_BYTES)
-            self._garbage += len(data)
-            for kind, payload in self.decoder.feed(data):
-                self._garbage, self._valid_s = 0, now_s
+            if line.ensure_open(now_s):
+                self._ask_s, self._is_started = now_s, False
+            if not line.is_open:
+                return []
+            for kind, payload in self.decoder.feed(line.read()):
+                line.accept(now_s)
                 if kind == IDENTITY:
                     self._begin(payload)
                 elif kind == SAMPLES and self._is_started and payload and len(payload) % SAMPLE.size == 0:
@@ -252,9 +227,7 @@ class Daq:
                     self.decoder.counts["unknown"] += 1
             self._supervise(now_s)
         except (OSError, ValueError, HardwareError) as error:
-            self._release()
-            self._reason, self._retry_s = str(error), now_s + self._retry_wait_s
-            self._retry_wait_s = min(2.0 * self._retry_wait_s, LONGEST_RETRY_S)
+            line.lose(now_s, error)
         return samples
 
     def fault(self, now_s: float) -> str:
@@ -270,24 +243,15 @@ class Daq:
 
     def close(self) -> None:
         """Stop the device and release the port."""
-        if self._port is not None:
+        if self._line.is_open:
             with suppress(OSError):
                 self._send(STOP)
                 self._sleep(SEND_S)
-            self._release()
-
-    def _release(self) -> None:
-        port, self._port = self._port, None
-        if port is not None:
-            # Closing would wait 30 s for unsent bytes. A device that is gone gives termios.error, which is no OSError.
-            with suppress(Exception):
-                port.reset_output_buffer()
-            with suppress(OSError):
-                port.close()
+            self._line.release()
 
     def _supervise(self, now_s: float) -> None:
         """Ask a device without samples for its identity. Raises OSError if no valid frame came for ``ANSWER_S``."""
-        if now_s - self._valid_s > ANSWER_S:
+        if now_s - self._line.valid_s > ANSWER_S:
             raise OSError(self._why())
         is_silent = not self._is_started or now_s - self._sample_s > ASK_S
         if is_silent and now_s >= self._ask_s:
@@ -329,26 +293,21 @@ class Daq:
                 fl, fr, rl, rr = (self._volt * edge for edge in edges)
                 samples.append(DaqSample(t_s, right, left, (fl, fr, rl, rr)))
                 self._sample_s = t_s
-        self._retry_wait_s = RETRY_S
+        self._line.recover()
         return samples
 
     def _why(self) -> str:
         """The reason why there are no samples."""
-        if self._port is None:
-            return self._reason
+        if not self._line.is_open:
+            return self._line.reason
         if version := self.decoder.other_version:
             return f"speaks version {version} of the protocol instead of {VERSION}; install the firmware that fits"
-        if self._garbage >= GARBAGE_BYTES:
-            return f"garbage at {self._config.baud} baud; check devices.daq.baud"
+        if reason := self._line.garbage_reason("devices.daq"):
+            return reason
         if not self._is_started:
             return "it does not answer; check its firmware, devices.daq.device and devices.daq.baud"
         return "it sends no samples, or has just started"
 
     def _send(self, kind: int, payload: bytes = b"") -> None:
-        self._opened().write(format_frame(kind, self._seq, payload))
+        self._line.write(format_frame(kind, self._seq, payload))
         self._seq += 1
-
-    def _opened(self) -> SerialPort:
-        if self._port is None:
-            raise OSError("the port is closed")
-        return self._port

@@ -16,8 +16,9 @@ from typing import Any
 
 from ccatp.config.onboard_models import DevicesConfig
 from ccatp.onboard.devices.bno055 import Bno055, Bus
-from ccatp.onboard.devices.daq import Daq, OpenPort, SerialPort
+from ccatp.onboard.devices.daq import Daq
 from ccatp.onboard.devices.outputs import PWM_ROOT, ExternalTimer, FanOutputs, Motors, OpenLines, explain
+from ccatp.onboard.devices.serial_line import OpenPort, SerialPort
 from ccatp.onboard.hardware import DeviceCheck, HardwareError, Readings
 
 I2C_TIMEOUT = 0x0702  # ioctl of linux/i2c-dev.h, in 10 ms
@@ -71,13 +72,16 @@ class I2cBus:
         self._bus.close()
 
 
-def open_serial(device: str, baud: int) -> SerialPort:
-    """Open a serial port for exclusive use, with reads that do not wait. Raises HardwareError."""
+def open_serial(device: str, baud: int, key: str = "devices.daq") -> SerialPort:
+    """Open a serial port for exclusive use, with reads that do not wait. Raises HardwareError.
+
+    ``key``: section of the configuration.
+    """
     serial = import_package("serial")
     try:
         port: SerialPort = serial.Serial(device, baud, timeout=0, write_timeout=0.002, exclusive=True)
     except (OSError, ValueError) as error:
-        raise explain(error, device, "dialout", "devices.daq") from None
+        raise explain(error, device, "dialout", key) from None
     return port
 
 
