@@ -2,7 +2,7 @@
 
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +12,7 @@ from ccatp.cli import common
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
-    from ccatp.config.onboard_models import OnboardConfig
-    from ccatp.onboard.devices.linux import LinuxHardware
+    from ccatp.onboard.kinds import RobotConfig, RobotKind
     from ccatp.onboard.tuning import Tuning
 
 CHECK_S = 2.0
@@ -41,25 +40,21 @@ def onboard(
 ) -> int:
     """Run the program on the robot's own computer: link server, low-level control, devices.
 
-    The configuration is that of configs/onboard.toml. It ends on SIGTERM or Ctrl-C: the wheels brake, the fans stay.
+    The configuration is that of configs/onboard.toml, or for a robot among beacons (kind = "beacons") that of
+    configs/beacon_onboard.toml. It ends on SIGTERM or Ctrl-C: the wheels brake, the fans stay.
     """
     ctx.obj = config_file
     if ctx.invoked_subcommand is not None:
         return 0
-    from ccatp.config.load import load_onboard_config
+    from ccatp.onboard.kinds import load_robot_config
 
-    cfg = load_onboard_config(config_file, settings)
-    return _check(cfg, json_output=json_output) if is_check else _run(cfg)
-
-
-def _hardware(cfg: "OnboardConfig", clock: Callable[[], float]) -> "LinuxHardware":
-    from ccatp.onboard.devices.linux import LinuxHardware
-
-    return LinuxHardware(cfg.devices, clock)
+    kind, cfg = load_robot_config(config_file, settings)
+    return _check(kind, cfg, json_output=json_output) if is_check else _run(kind, cfg)
 
 
-def _run(cfg: "OnboardConfig") -> int:
+def _run(kind: "RobotKind", cfg: "RobotConfig") -> int:
     import sys
+    from functools import partial
 
     import structlog
 
@@ -75,7 +70,7 @@ def _run(cfg: "OnboardConfig") -> int:
         host, port = listener.getsockname()[:2]
         click.echo(f"ccatp: robot on {host}:{port}", err=True)
         try:
-            return run(cfg, lambda clock: _hardware(cfg, clock), listener, key, log)
+            return run(partial(kind.hardware, cfg), partial(kind.robot, cfg), listener, key, log)
         except HardwareError as error:
             raise DeviceUnreachable(str(error)) from error
 
@@ -91,9 +86,9 @@ def _listen(host: str, port: int) -> socket.socket:
         ) from error
 
 
-def _check(cfg: "OnboardConfig", *, json_output: bool) -> int:
+def _check(kind: "RobotKind", cfg: "RobotConfig", *, json_output: bool) -> int:
     boot_s = time.monotonic()
-    checks = _hardware(cfg, lambda: time.monotonic() - boot_s).check(CHECK_S)
+    checks = kind.hardware(cfg, lambda: time.monotonic() - boot_s).check(CHECK_S)
     lines = []
     for check in checks:
         found = f"{check.identity or 'found'}" if check.found else "not found"
@@ -120,9 +115,13 @@ def tune(
 ) -> int:  # fmt: skip
     """Find friction, slope and gains of the wheel servos with free wheels, in about half a minute."""
     from ccatp.config.load import load_onboard_config
+    from ccatp.onboard.devices.linux import LinuxHardware
     from ccatp.onboard.hardware import HardwareError
+    from ccatp.onboard.kinds import kind_in
     from ccatp.onboard.tuning import tune as find
 
+    if why := kind_in(config_file or group_config, settings).no_tuning:
+        raise click.UsageError(why)
     if not wheels_are_free:
         raise click.UsageError("the wheels will turn at up to full speed: lift the robot, then add --wheels-are-free")
     cfg = load_onboard_config(config_file or group_config, settings)
@@ -131,7 +130,7 @@ def tune(
     def clock() -> float:
         return time.monotonic() - boot_s
 
-    hardware = _hardware(cfg, clock)
+    hardware = LinuxHardware(cfg.devices, clock)
     try:
         hardware.start()
         found = find(hardware, cfg.servo, clock, time.sleep, lambda text: click.echo(text, err=True))

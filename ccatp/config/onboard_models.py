@@ -140,6 +140,7 @@ class DevicesConfig(Model):
 class OnboardConfig(Model):
     """The whole configuration of the on-board program."""
 
+    kind: Literal["mirror"]  # of the robot
     link: OnboardLinkConfig
     robot: OnboardRobotConfig
     servo: WheelServoConfig

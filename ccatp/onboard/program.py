@@ -17,11 +17,10 @@ from dataclasses import dataclass, field
 
 import structlog
 
-from ccatp.config.onboard_models import OnboardConfig
 from ccatp.links import realtime
 from ccatp.links.service_manager import take_from
-from ccatp.onboard.hardware import Hardware
-from ccatp.onboard.robot import OnboardRobot
+from ccatp.onboard.controlled import ControlledRobot
+from ccatp.onboard.kinds import Controlled, RobotHardware
 from ccatp.onboard.server import TcpRobotServer
 
 PRIORITY = 40  # of SCHED_FIFO, where permitted: below the kernel's own interrupt threads (50)
@@ -98,11 +97,11 @@ class OnboardServer(TcpRobotServer):
         each_step: called after each step, with the robot and the time.
     """
 
-    robot: OnboardRobot
+    robot: ControlledRobot
 
     def __init__(
         self,
-        robot: OnboardRobot,
+        robot: ControlledRobot,
         loop_hz: float,
         boot_s: float,
         *,
@@ -116,7 +115,7 @@ class OnboardServer(TcpRobotServer):
         self.lateness = Lateness()
         self._reported: dict[str, float] = {}
         self._faults: frozenset[str] = frozenset()
-        self.each_step: list[Callable[[OnboardRobot, float], None]] = []
+        self.each_step: list[Callable[[ControlledRobot, float], None]] = []
 
     def begin(self, now_s: float) -> None:
         """Start the server; the robot's clock counts from ``boot_s``, since samples have that time."""
@@ -166,30 +165,23 @@ class OnboardServer(TcpRobotServer):
 
 
 async def serve(
-    cfg: OnboardConfig,
-    hardware: Hardware,
+    robot: ControlledRobot,
+    loop_hz: float,
     listener: socket.socket,
     stop: asyncio.Event,
     key: bytes | None,
     log: structlog.typing.FilteringBoundLogger,
     boot_s: float,
-    *each_step: Callable[[OnboardRobot, float], None],
+    *each_step: Callable[[ControlledRobot, float], None],
 ) -> None:
     """Run the robot on started hardware until ``stop`` is set; call ``each_step`` after each step of the loop."""
     notifier, watchdog_s = take_from(os.environ)
-    robot = OnboardRobot(cfg, hardware)
-    server = OnboardServer(
-        robot,
-        cfg.servo.loop_hz,
-        boot_s,
-        key=key,
-        log=log,
-    )
+    server = OnboardServer(robot, loop_hz, boot_s, key=key, log=log)
     server.each_step += each_step
     if watchdog_s is not None:
         period_s, sent_s = _WATCHDOG_SHARE * watchdog_s, [0.0]
 
-        def stroke(_: OnboardRobot, now_s: float) -> None:
+        def stroke(_: ControlledRobot, now_s: float) -> None:
             # Sent from the control loop, so that the messages end when this loop hangs.
             if now_s - sent_s[0] >= period_s:
                 sent_s[0] = now_s
@@ -218,13 +210,16 @@ async def serve(
 
 
 def run(
-    cfg: OnboardConfig,
-    make_hardware: Callable[[Callable[[], float]], Hardware],
+    make_hardware: Callable[[Callable[[], float]], RobotHardware],
+    make_robot: Callable[[RobotHardware], Controlled],
     listener: socket.socket,
     key: bytes | None,
     log: structlog.typing.FilteringBoundLogger,
 ) -> int:
-    """Run until SIGTERM, SIGINT or SIGHUP; ``make_hardware`` gets the robot's clock. Raises ``HardwareError``."""
+    """Run until SIGTERM, SIGINT or SIGHUP. Raises ``HardwareError``.
+
+    ``make_hardware`` gets the robot's clock, ``make_robot`` the started hardware.
+    """
     loop = asyncio.new_event_loop()
     boot_s = time.monotonic()
     hardware = make_hardware(lambda: time.monotonic() - boot_s)
@@ -234,7 +229,8 @@ def run(
         stop = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             loop.add_signal_handler(number, stop.set)
-        loop.run_until_complete(serve(cfg, hardware, listener, stop, key, log, boot_s))
+        controlled = make_robot(hardware)
+        loop.run_until_complete(serve(controlled.robot, controlled.loop_hz, listener, stop, key, log, boot_s))
     finally:
         hardware.close()
         loop.close()

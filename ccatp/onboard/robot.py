@@ -13,23 +13,20 @@ Otherwise only fan commands change the fans.
 """
 
 from math import inf, pi
-from typing import Any, TypeVar
 
 from ccatp.config.onboard_models import EdgeThresholdConfig, OnboardConfig
 from ccatp.links.robot_codec import RobotFrame, encode
-from ccatp.links.robot_messages import CommandEcho, RobotData
+from ccatp.links.robot_messages import RobotData
+from ccatp.onboard.controlled import SAME_S, ControlledRobot
 from ccatp.onboard.hardware import Hardware, HardwareError
-from ccatp.onboard.rules import HELD, LinkedRobot, SlideMonitor
+from ccatp.onboard.rules import HELD, SlideMonitor
 from ccatp.onboard.wheel_servo import WheelServo
 
 # Without these the robot does not move. Its clients decide what to do about a weak fan or battery.
 NEEDED = ("imu", "encoder_right", "encoder_left", "edge", "stall")
-_SAME_S = 1e-9
 _SLIDE_HOLD_S = 0.5
-_LINE_SAMPLES = 24  # of one sensor in a line: a burst after a gap must not exceed the line's limit
 
 WheelRates = tuple[float, float | None, float | None]
-Row = TypeVar("Row", bound=tuple[Any, ...])
 
 
 class EdgeThreshold:
@@ -63,20 +60,17 @@ class EdgeThreshold:
         return int(self._is_on)
 
 
-class OnboardRobot(LinkedRobot):
-    """The robot; ``hardware`` has been started.
+class OnboardRobot(ControlledRobot):
+    """The robot; ``hardware`` has been started. The barrier outside this program is the external timer.
 
     Attributes:
-        faults: reason of each present fault, by its name on the link or ``motors``.
         voltages_v: of the (right, left) motor.
-        late_steps: steps of the control loop that came later after the last one than the external timer waits.
-        dropped_samples: samples in no frame: a frame had too many, or they arrived after their frame.
     """
 
     def __init__(self, cfg: OnboardConfig, hardware: Hardware, commands_delay_frames: int = 0) -> None:
         link, robot = cfg.link, cfg.robot
         limits = link.ttl_s, robot.max_wheel_rad_s, robot.fan_floor
-        super().__init__(limits, 1.0 / link.frame_hz, link.frame_hz, commands_delay_frames)
+        super().__init__(limits, link.frame_hz, link.sample_latency_s, commands_delay_frames)
         self._cfg, self._hardware = cfg, hardware
         self._servos = WheelServo(cfg.servo), WheelServo(cfg.servo)
         self._edges = [EdgeThreshold(cfg.edges) for _ in range(4)]
@@ -86,12 +80,9 @@ class OnboardRobot(LinkedRobot):
             (robot.grip_slide_m_s, robot.grip_turn_rad), robot.wheel_radius_m, robot.wheel_base_m
         )
         self._slides_until_s = 0.0
-        self.faults: dict[str, str] = {}
         self.voltages_v = 0.0, 0.0
-        self.late_steps = self.dropped_samples = 0
         self._control_s: float | None = None
         self._soc, self._stall = 1.0, ""
-        self._line = b""
         # Samples that are not in a frame yet.
         self._imu: list[tuple[float, float, float]] = []
         self._enc: list[WheelRates] = []
@@ -197,26 +188,11 @@ class OnboardRobot(LinkedRobot):
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
-    def advance(self) -> None:
-        """Close the next frame with every sample since the last one."""
-        self.seq += 1
-        self._close_frame(self.seq / self.frame_hz)
-
-    def advance_to(self, now_s: float) -> None:
-        """Close the frame that is due at ``now_s``; frames that were missed in a stop of this computer are skipped.
-
-        Its time is ``sample_latency_s`` ago, so that it contains every sample since the last frame.
-        """
-        t_s = max(now_s - self._cfg.link.sample_latency_s, self.t_s + 0.1 * self.frame_s)
-        self.seq = max(self.seq + 1, int(now_s * self.frame_hz + 1e-6))
-        self._close_frame(t_s)
-
     def _close_frame(self, t_s: float) -> None:
         since_s, self.t_s = self.t_s, t_s
-        drive_seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
         # Clients see a motor that cannot be set as a stalled motor.
         faults = tuple(sorted({"stall" if name == "motors" else name for name in self.faults}))
-        gravity = self._gravity if self._gravity is not None and self._gravity[0] <= t_s + _SAME_S else None
+        gravity = self._gravity if self._gravity is not None and self._gravity[0] <= t_s + SAME_S else None
         if gravity is not None:
             self._gravity = None
         frame = RobotFrame(
@@ -228,21 +204,9 @@ class OnboardRobot(LinkedRobot):
             gravity=gravity,
             fans=self.fans.duty,
             soc=self._soc,
-            cmd=CommandEcho(drive_seq, round(age_s, 6), round(permit_age_s, 6), is_held),
+            cmd=self._echo(t_s),
             faults=faults,
             sliding=t_s < self._slides_until_s,
         )
         self._line = encode(frame)
         self.delivered_seq = self.seq
-
-    def _take_samples(self, samples: list[Row], since_s: float) -> list[Row]:
-        """Remove and return the samples of the frame; later ones stay in ``samples``."""
-        end = next((k for k, row in enumerate(samples) if row[0] > self.t_s + _SAME_S), len(samples))
-        due, samples[:] = samples[:end], samples[end:]
-        found = [row for row in due if row[0] > since_s + _SAME_S or not since_s][-_LINE_SAMPLES:]
-        self.dropped_samples += end - len(found)
-        return found
-
-    @property
-    def delivered_line(self) -> bytes:
-        return self._line

@@ -31,6 +31,7 @@ from ccatp.config.load import load_config, load_onboard_config
 from ccatp.config.onboard_models import DevicesConfig
 from ccatp.links import realtime
 from ccatp.mirror.mirror import build_mirror
+from ccatp.onboard.controlled import ControlledRobot
 from ccatp.onboard.devices.daq import SAMPLE, SAMPLES
 from ccatp.onboard.devices.linux import DeviceAccess, LinuxHardware
 from ccatp.onboard.hardware import Hardware
@@ -164,11 +165,11 @@ class Truth(SurveyTruth):
         return time.monotonic() - self._start_s
 
 
-def tell_held() -> Callable[[OnboardRobot, float], None]:
+def tell_held() -> Callable[[ControlledRobot, float], None]:
     """Writes when the wheels are held, and when not."""
     was_held: list[bool] = []
 
-    def tell(robot: OnboardRobot, now_s: float) -> None:
+    def tell(robot: ControlledRobot, now_s: float) -> None:
         is_held = robot.rules.is_held
         if was_held != [is_held]:
             was_held[:] = [is_held]
@@ -218,7 +219,9 @@ def main() -> int:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
         truth = GroundTruthPublisher(Truth(simulated.world, boot_s), options.truth)
         answering = asyncio.create_task(truth.serve())
-        await serve(onboard, hardware, listener, stop, None, log, boot_s, tell_held())
+        await serve(
+            OnboardRobot(onboard, hardware), onboard.servo.loop_hz, listener, stop, None, log, boot_s, tell_held()
+        )
         answering.cancel()
         truth.close()
         if simulated.world.is_fallen:

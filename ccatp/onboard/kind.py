@@ -1,0 +1,26 @@
+"""The robot on mirrors as a kind of robot."""
+
+from collections.abc import Callable
+
+from ccatp.config.onboard_models import OnboardConfig
+from ccatp.missions import Part
+from ccatp.onboard.devices.linux import LinuxHardware
+from ccatp.onboard.kinds import Controlled, RobotKind
+from ccatp.onboard.robot import OnboardRobot
+
+
+def linux_hardware(cfg: OnboardConfig, clock: Callable[[], float]) -> LinuxHardware:
+    """Its devices."""
+    return LinuxHardware(cfg.devices, clock)
+
+
+def onboard_robot(cfg: OnboardConfig, hardware: LinuxHardware) -> Controlled:
+    """The robot on started hardware."""
+    return Controlled(OnboardRobot(cfg, hardware), cfg.servo.loop_hz)
+
+
+MIRROR = RobotKind(
+    load=Part("ccatp.config.load:load_onboard_config"),
+    make_hardware=Part(f"{__name__}:linux_hardware"),
+    make_robot=Part(f"{__name__}:onboard_robot"),
+)
