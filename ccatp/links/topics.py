@@ -122,6 +122,8 @@ class MissionStatus(Message):
     friction: float = 0.0  # of the tyres, by the creep of turns; 0: not measured
     grip: float = 0.0  # full thrust over the least that holds the robot on all of the mirror with it
     alarms: list[Alarm] = []  # the highest severity first, ended ones last
+    command: str = ""  # the newest command of an operator that was accepted: pause, resume, abort or stop
+    commanded_by: str = ""  # its operator
     summary_state: str = ""  # offline, standby, disabled, enabled or fault; empty in older recordings
 
 

@@ -122,7 +122,7 @@ class SummaryBuilder:
         self._points, self._lower_bound_s = 0, 0.0
         self._measured = self._skipped = self._unreliable = 0
         self._left_out: Mapping[str, Sequence[str]] = {}
-        self._mission_time_s = 0.0
+        self._mission_time_s, self._is_complete = 0.0, False
         self._ticks_us = RunningStatistics(TICKS)
         self._open_truth, self._open_track = np.empty((0, 8)), np.empty((0, 8))
         self._distances, self._within = RunningStatistics(EXACT_ROWS), 0
@@ -206,10 +206,15 @@ class SummaryBuilder:
         skipped: int,
         mission_time_s: float,
         left_out: Mapping[str, Sequence[str]] = MappingProxyType({}),
+        *,
+        is_complete: bool = False,
     ) -> None:
-        """Points measured and skipped, the robot's time from start to end, and points left out, by the reason."""
+        """Points measured and skipped, the robot's time from start to end, and points left out, by the reason.
+
+        ``is_complete``: the mission came to its end; only then the budget can have been kept.
+        """
         self.set_counts(measured, skipped)
-        self._mission_time_s, self._left_out = mission_time_s, left_out
+        self._mission_time_s, self._left_out, self._is_complete = mission_time_s, left_out, is_complete
 
     def add_grip(self, friction: float, margin: float) -> None:
         """Friction and margin of thrust as measured last; 0: not measured."""
@@ -249,7 +254,9 @@ class SummaryBuilder:
         self._settle(is_over=True)
         cfg, is_sim = self._cfg, self._is_sim
         arrivals = np.array(list(self._arrivals.values()))
-        distances, count = self._distances, self._distances.count
+        # Without a point that was measured the robot stood at its known start: no figure of its localization.
+        distances = self._distances if self._measured else RunningStatistics(1)
+        count = distances.count
         rms_rad = sqrt(self._squared_turns / count) if count else nan
         return {
             "mirror": cfg.mirror.name,
@@ -273,7 +280,7 @@ class SummaryBuilder:
             "heading_error_mrad": {"rms": rounded(1e3 * rms_rad, 3)},
             "mission_time_s": rounded(self._mission_time_s, 3),
             "lower_bound_s": rounded(self._lower_bound_s, 3),
-            "within_budget": self._mission_time_s <= cfg.run.budget_s,
+            "within_budget": self._within_budget(),
             "danger": {
                 "true_edges": self._true_edges if is_sim else None,
                 "false_edges": self._false_edges if is_sim else None,
@@ -288,6 +295,11 @@ class SummaryBuilder:
             "panels": self._panels(),
             "wall": wall_figures(self._mission_time_s, wall_s, self._ticks_us.sample),
         }
+
+    def _within_budget(self) -> bool | None:
+        if self._mission_time_s > self._cfg.run.budget_s:
+            return False
+        return True if self._measured and self._is_complete else None
 
     def _panels(self) -> dict[str, Any]:
         known = self._injected or {}
@@ -336,11 +348,13 @@ class SummaryBuilder:
         return np.concatenate(found) if found else np.empty((0, _CLEARANCE + 1))
 
 
-def format_table(summary: Mapping[str, Any]) -> str:
-    """The summary as a short table for a terminal: one line a section, a dash for an unknown value."""
+def format_table(summary: Mapping[str, Any], ended: str = "") -> str:
+    """The summary as a short table for a terminal: how it ended, then one line a section, a dash for null."""
+    summary = {name: value for name, value in summary.items() if name != "ended"}
     single = [f"{key} {_text(value)}" for key, value in summary.items() if not isinstance(value, Mapping)]
     sections = [(name, section) for name, section in summary.items() if isinstance(section, Mapping)]
-    lines = [("run", single), *((n, [f"{key} {_text(value)}" for key, value in s.items()]) for n, s in sections)]
+    lines = [("ended", [ended])] if ended else []
+    lines += [("run", single), *((n, [f"{key} {_text(value)}" for key, value in s.items()]) for n, s in sections)]
     width = max(len(name) for name, _ in lines)
     return "\n".join(f"{name.replace('_', ' '):<{width}}  {'  '.join(values)}" for name, values in lines)
 

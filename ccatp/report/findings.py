@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from ccatp.core import UNRELIABLE, DeckPose, Fix, FloatArray, PointId, StopKind
+from ccatp.errors import ExitStatus
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.filters.metrics import Consistency, consistency, rms
 from ccatp.mirror.layout import POINTS_PER_PANEL
@@ -21,6 +22,7 @@ from ccatp.records.summary import arrival_error_m, distribution, measured_error_
 from ccatp.records.timeline import common_rows, row_before, rows_of
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, RunRecord
 from ccatp.survey.composition import plan_survey
+from ccatp.survey.ending import ending_of, read_ending, why_text
 from ccatp.survey.fix_gate import nis_of
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import ORDERS
@@ -371,7 +373,8 @@ def findings_of(record: RunRecord) -> Findings:
         planned = {row.point.panel for row in record.points or ()}
         alignment = survey_result(record.mirror, cfg.align, cfg.robot.puck_height_m, record.measured, planned)
         against = compare(alignment.panels, record.injected) if record.injected else None
-    figures = None if errors is None else error_figures(errors)
+    # Without a point that was measured there is no figure of the localization, as in ``summary.json``.
+    figures = None if errors is None or not record.measured else error_figures(errors)
     outcome, points, budget = outcome_of(record), point_verdicts(record), time_budget(record)
     quality = quality_of(record, alignment)
     return Findings(record, outcome, points, errors, figures, budget, alignment, against, quality)
@@ -422,10 +425,10 @@ _FINISHED = "run finished: status 0"
 def outcome_of(record: RunRecord) -> PointOutcome:
     """Outcome of the run by the last status, otherwise by the log; without both it is running or was killed."""
     status = record.last_status
-    if status is not None and status.outcome:
-        return PointOutcome(status.outcome, status.cause, is_good=status.outcome == COMPLETE)
-    if status is not None and status.exit_status >= 0:
-        return PointOutcome(f"ended with status {status.exit_status}, {status.state}", status.cause, is_good=False)
+    if status is not None and (status.outcome or status.exit_status >= 0):
+        ending = read_ending(record.summary) or ending_of(status, ExitStatus(max(status.exit_status, 0)))
+        text = status.outcome or f"ended with status {status.exit_status}, {status.state}"
+        return PointOutcome(text, why_text(ending), is_good=status.outcome == COMPLETE, alarms=ending.alarms)
     if record.log and record.log[-1].text == _FINISHED:
         return PointOutcome(COMPLETE, "", is_good=True)
     if status is None:

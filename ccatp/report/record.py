@@ -26,6 +26,7 @@ from ccatp.records.run_reader import CONFIG, STORE, RunReadError, Trace, check_r
 from ccatp.records.state_log import LogLine, StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint, StoreError, read_survey
 from ccatp.records.timeline import Timeline, first_of_each, iter_places, read_timeline
+from ccatp.survey.ending import AlarmAtEnd
 
 COMPLETE = "complete"
 WITHIN_MM = 10.0  # the thesis's requirement on arrivals
@@ -57,11 +58,12 @@ class RecordedSession:
 
 
 class PointOutcome(NamedTuple):
-    """Outcome of a run in a few words, its cause if recorded, and whether the run is complete."""
+    """Outcome of a run in a few words, by whom and why if recorded, whether it is complete, and alarms at its end."""
 
     text: str
     cause: str
     is_good: bool
+    alarms: Sequence[AlarmAtEnd] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

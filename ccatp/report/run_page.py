@@ -116,6 +116,7 @@ def run_data(found: Findings) -> dict[str, Any]:
         "seed": record.cfg.run.seed,
         "outcome": found.outcome.text,
         "cause": found.outcome.cause,
+        "alarms_at_end": [{"name": one.name, "severity": one.severity} for one in found.outcome.alarms],
         "observation": observation_of(record),
         "coverage": coverage_of(found),
         "points": {

@@ -102,7 +102,9 @@ class Survey(EngagementRules[SurveyState]):
         """Points that were skipped, or will not be measured any more, with the reason."""
         out = dict(s.failure_causes)
         if s.kind is Kind.OVER:
-            why, over = text_of(s.cause) or str(s.outcome), {*s.done, *out}
+            # What held the robot when an operator stopped it is not why the mission ended.
+            is_stopped = s.outcome is SurveyOutcome.STOPPED
+            why, over = "stopped by an operator" if is_stopped else text_of(s.cause) or str(s.outcome), {*s.done, *out}
             out |= {point: why for point in self._points if point not in over}
         return out
 

@@ -81,6 +81,7 @@ class MainLoop:
         self._is_new_session = False
         self._was_at_rest = False
         self._levels_sent = 0
+        self._command = self._commanded_by = ""  # the newest command that was accepted
         self._alarms = AlarmWatch(context, danger, AlarmList(args.run_dir, self.log))
         self._runner = runner = make_runner(self)
         self._telemetry = runner.telemetry
@@ -246,6 +247,7 @@ class MainLoop:
         status.bad_lines = link.counts["bad_lines"]
         status.bad_line = link.first_bad_line
         status.alarms = self._alarms.alarms.alarms
+        status.command, status.commanded_by = self._command, self._commanded_by
         status.summary_state = str(self._runner.mission.state.summary_state)
         return status
 
@@ -272,6 +274,7 @@ class MainLoop:
         if refusal is None:
             self._telemetry.notify_operator("info", f"{by}: {f'{request.cmd} {request.name}'.strip()}")
             if request.cmd in COMMANDS:
+                self._command, self._commanded_by = str(request.cmd), by
                 self.release_time()
         return refusal
 

@@ -23,6 +23,7 @@ from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
 from ccatp.missions import SEARCHED, kind_of
 from ccatp.records.summary import format_table
+from ccatp.survey.ending import ending_text, read_ending
 from ccatp.survey.events import DONE, HELD, IDLE, MEASURING, SETTLING, WAITS_FOR, waits_for
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
@@ -141,7 +142,9 @@ class RunView:
     def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
         """Print only JSON on standard output, or a table."""
         try:
-            print(json.dumps(summary, indent=1) if as_json else format_table(summary), flush=True)
+            ending = read_ending(summary)
+            ended = "" if ending is None else printable(ending_text(ending))
+            print(json.dumps(summary, indent=1) if as_json else format_table(summary, ended), flush=True)
         except OSError as error:
             # The mission is over and its result is stored; the remaining output is discarded.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from types import FrameType
 from typing import Any
 
+import msgspec
 import zmq
 
 from ccatp.config.files import read_toml, write_durably
@@ -62,6 +63,7 @@ from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat, MissionStatu
 from ccatp.missions import kind_of
 from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import TOKEN_FILE, make_token
+from ccatp.survey.ending import ending_of
 
 # Period of the polls of messages and processes; waking up for each message would double the cost in lockstep.
 POLL_S = 0.02
@@ -169,6 +171,7 @@ class SupervisedRun:
         self._started_s = started_s
         self._children = ProcessManager(cfg.processes, self._command_of, self._notify_operator)
         self._is_interrupted = False
+        self._failure = ""  # the death of a process that ended the run
         self._has_begun = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
@@ -204,6 +207,8 @@ class SupervisedRun:
         self._webhook.close(WEBHOOK_PATIENCE_S)
         for remark in collector.remarks:
             self._notify_operator("warning", remark)
+        ending = ending_of(collector.status, status, failure=self._failure)
+        summary = {"ended": msgspec.to_builtins(ending), **summary}  # one of an earlier session keeps its own end
         self._write(summary)
         self._log.info("run_finished", status=int(status))
         if self._options.shows_summary:
@@ -250,6 +255,7 @@ class SupervisedRun:
             # A dead process is handled first, because the messages of the others are its consequence.
             if (death := self._children.poll(now_s)) is not None:
                 self._log.error("process_died", name=death.name, code=death.code)
+                self._failure = death.text
                 if death.end is ProcessEnd.END:
                     # The process has reported why. After a restart the robot may be anywhere, so the status is held.
                     return ExitStatus.HELD if self._children.restarts else ExitStatus(death.code)

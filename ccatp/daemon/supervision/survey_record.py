@@ -27,6 +27,7 @@ from ccatp.records.store import StoredSurvey, StoreError, read_survey
 from ccatp.records.summary import PanelFits, SummaryBuilder
 from ccatp.records.timeline import iter_places, read_timeline
 from ccatp.report.foxglove import Views
+from ccatp.survey.events import SurveyOutcome
 
 # Topics of a survey's summary; a recording holds twenty times as much.
 SUMMARISED = {"mission", "track", "truth", "arrival", "fix", "danger_event"}
@@ -65,7 +66,10 @@ class _SurveySession:
             if not self.has_status:  # only the first: a main loop that takes over plans only the rest
                 self.has_status = True
                 builder.set_plan(message.total, message.lower_bound_s)
-            builder.set_mission(message.done, message.skipped, message.elapsed_s, message.left_out)
+            is_complete = message.outcome == SurveyOutcome.COMPLETE
+            builder.set_mission(
+                message.done, message.skipped, message.elapsed_s, message.left_out, is_complete=is_complete
+            )
             builder.add_grip(message.friction, message.grip)
 
     def _on_deck(self, track: TrackMessage) -> FloatArray:

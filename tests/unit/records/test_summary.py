@@ -24,6 +24,7 @@ def builder() -> SummaryBuilder:
 def make(*, lower_bound_s: float = 3000.0, is_sim: bool = True) -> SummaryBuilder:
     made = SummaryBuilder(CFG, MIRROR, is_sim=is_sim)
     made.set_plan(693, lower_bound_s)
+    made.set_counts(1, 0)
     return made
 
 
@@ -181,7 +182,7 @@ def test_panels_compare_fit_with_injected(builder: SummaryBuilder) -> None:
 
 
 def test_a_whole_summary_has_the_keys_of_the_contract_in_their_order(builder: SummaryBuilder) -> None:
-    builder.set_mission(690, 3, 3600.0)
+    builder.set_mission(690, 3, 3600.0, is_complete=True)
     builder.add_ticks([100.0, 110.0])
     builder.add_ticks(np.array([120.0]))
     built = builder.build(60.0)
@@ -196,6 +197,30 @@ def test_a_whole_summary_has_the_keys_of_the_contract_in_their_order(builder: Su
     assert built["within_budget"] is True
     assert built["wall"] == {"time_s": 60.0, "realtime_factor": 60.0, "tick_us_p50": 110.0, "tick_us_p99": 119.8}
     json.dumps(built, allow_nan=False)
+
+
+def test_without_a_measured_point_no_figure_of_localization_and_no_budget_is_claimed(builder: SummaryBuilder) -> None:
+    truth, track = tables(40)
+    builder.add_truth(truth)
+    builder.add_track(track)
+    builder.set_mission(0, 0, 30.0, is_complete=True)
+    built = builder.build()
+    assert set(built["localization_error_mm"].values()) == {None}
+    assert (built["heading_error_mrad"]["rms"], built["within_budget"]) == (None, None)
+    builder.set_mission(1, 0, 30.0, is_complete=True)
+    built = builder.build()
+    assert None not in {*built["localization_error_mm"].values(), built["heading_error_mrad"]["rms"]}
+    assert built["within_budget"] is True
+
+
+@pytest.mark.parametrize(
+    ("time_s", "is_complete", "expected"), [(30.0, True, True), (30.0, False, None), (3601.0, False, False)]
+)
+def test_only_a_complete_mission_has_kept_its_budget(
+    builder: SummaryBuilder, time_s: float, is_complete: bool, expected: bool | None
+) -> None:
+    builder.set_mission(5, 0, time_s, is_complete=is_complete)
+    assert builder.build()["within_budget"] is expected
 
 
 def test_a_real_robot_has_null_where_the_truth_is_needed() -> None:
@@ -242,8 +267,11 @@ def test_a_diverged_estimate_gives_a_file_that_json_can_hold(builder: SummaryBui
 def test_the_table_has_every_figure_and_counts_points_left_out_by_reason(builder: SummaryBuilder) -> None:
     text = format_table(builder.build())
     assert len(text.splitlines()) == 9
-    for part in ("points                 total 693  measured 0", "mean -", "within_budget yes"):
+    for part in ("points                 total 693  measured 1", "mean -", "within_budget -"):
         assert part in text
+    assert format_table({"ended": {"what": "stopped"}, **builder.build()}, "stopped by eva") == "\n".join(
+        [f"{'ended':<21}  stopped by eva", *text.splitlines()]
+    )
     builder.set_mission(1, 2, 3.0, {"operator": ["1-2-3", "1-2-4"], "no fix": ["1-2-5"]})
     (line,) = (line for line in format_table(builder.build()).splitlines() if line.startswith("points"))
     assert line.endswith("left_out 2 (operator), 1 (no fix)")

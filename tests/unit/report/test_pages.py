@@ -148,6 +148,10 @@ def test_a_run_given_up_before_its_first_point_says_why(recorded: Path) -> None:
             {"outcome": "", "exit_status": 4, "state": "held", "cause": "stuck"},
             ("ended with status 4, held", "stuck", False),
         ),
+        (
+            {"outcome": "stopped", "exit_status": 4, "cause": "encoder samples stale", "commanded_by": "eva"},
+            ("stopped", "by eva, held before: encoder samples stale", False),
+        ),
         ({"outcome": "", "exit_status": -1, "state": "driving", "cause": ""}, ("interrupted", "while driving", False)),
     ],
 )
@@ -157,7 +161,16 @@ def test_outcomes(recorded: Path, changes: dict[str, object], outcome: tuple[str
         whole = replace(whole, log=())
     (session,) = whole.sessions
     status = msgspec.structs.replace(session.statuses[-1], **changes)
-    assert outcome_of(replace(whole, sessions=(replace(session, statuses=(status,)),))) == outcome
+    found = outcome_of(replace(whole, sessions=(replace(session, statuses=(status,)),)))
+    assert (found.text, found.cause, found.is_good) == outcome
+
+
+def test_alarms_that_were_active_at_the_end_are_on_the_page(recorded: Path) -> None:
+    whole = read_record(recorded)
+    ended = {"what": "stopped", "by": "operator", "alarms": [{"name": "lifted", "severity": "hold", "cause": "in air"}]}
+    page = run_page(findings_of(replace(whole, summary={**(whole.summary or {}), "ended": ended})))
+    assert "Alarms active at the end" in page
+    assert "lifted: in air" in page
 
 
 # -- quality of the measurement ---------------------------------------------------------------------------------------
