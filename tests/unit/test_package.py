@@ -132,19 +132,27 @@ def tokens_of(tokens: list[Token]) -> Iterator[Token]:
         yield from tokens_of(token.children or [])
 
 
-def test_links_of_the_readme_work_on_a_package_index_and_lead_to_files_that_are_there() -> None:
-    root = PACKAGING.parent
-    source = tomllib.loads((root / "pyproject.toml").read_text())["project"]["urls"]["Source"]
-    pages, files = f"{source}/blob/main/", source.replace("//github.com", "//raw.githubusercontent.com") + "/main/"
-    tokens = list(tokens_of(MarkdownIt("commonmark").parse((root / "README.md").read_text(encoding="utf-8"))))
+def links_and_pictures(readme: str) -> tuple[list[Token], list[str], list[str]]:
+    tokens = list(tokens_of(MarkdownIt("commonmark").parse(readme)))
     links = [str(token.attrs["href"]) for token in tokens if token.type == "link_open"]
-    pictures = [str(token.attrs["src"]) for token in tokens if token.type == "image"]
+    return tokens, links, [str(token.attrs["src"]) for token in tokens if token.type == "image"]
+
+
+def test_links_of_the_readme_lead_to_files_that_are_there_and_are_absolute_on_a_package_index() -> None:
+    root = PACKAGING.parent
+    project = tomllib.loads((root / "pyproject.toml").read_text())
+    source = project["project"]["urls"]["Source"]
+    readme = (root / "README.md").read_text(encoding="utf-8")
+    tokens, links, pictures = links_and_pictures(readme)
     assert len(links) > 20
     assert pictures
-    assert [link for link in links if not link.startswith(pages)] == []
-    assert [picture for picture in pictures if not picture.startswith(files)] == []
-    places = [*(link.removeprefix(pages) for link in links), *(picture.removeprefix(files) for picture in pictures)]
-    assert [place for place in places if not (root / place).is_file()] == []
+    assert [place for place in (*links, *pictures) if not (root / place).is_file()] == []
+    published = readme
+    for rule in project["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]["substitutions"]:
+        published = re.sub(rule["pattern"], rule["replacement"], published)
+    _, absolute, drawn = links_and_pictures(published)
+    assert absolute == [f"{source}/blob/main/{link}" for link in links]
+    assert drawn == [f"{source.replace('//github.com', '//raw.githubusercontent.com')}/main/{one}" for one in pictures]
     # a link without a definition is a text in brackets
     assert [token.content for token in tokens if token.type == "text" and re.search(r"\[.*\]", token.content)] == []
 

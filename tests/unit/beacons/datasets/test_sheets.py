@@ -26,13 +26,15 @@ def text(folder: Path, content: str, name: str = "a.csv") -> Path:
     return folder / name
 
 
-def workbook(file: Path) -> Path:
+def workbook(file: Path, far: tuple[int, int] = (3, 3)) -> Path:
+    """``far``: row and column of a cell that is written as well."""
     book = Workbook()
     sheet = book.active
     assert sheet is not None
     sheet.title = "Zigbee"
     for row in (["Distance", None, "RSSI"], [0.5, None, -40], [1, None, -47]):
         sheet.append(row)
+    sheet.cell(*far, -47)
     book.save(file)
     return file
 
@@ -160,6 +162,8 @@ def test_what_is_no_workbook_is_refused(tmp_path: Path) -> None:
     bomb = with_part(tmp_path / "f.xlsx", "large.xml", " " * 5_000_001, "w")
     with pytest.raises(RadioDataError, match="longer than 5000000 bytes"):
         read_workbook(bomb)
+    with pytest.raises(RadioDataError, match="more than 500000 cells"):
+        read_workbook(workbook(tmp_path / "g.xlsx", far=(1_048_576, 16_384)))
 
 
 def test_beacon_files(tmp_path: Path) -> None:
