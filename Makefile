@@ -4,6 +4,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 NEWEST_VENV ?= .venv-newest
+AUDIT_VENV ?= .venv-audit
 RUN_VENV ?= .venv-run
 ARGS ?=
 PYTEST_ARGS ?=
@@ -22,7 +23,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $$(($(WORKERS) + 1)) --dist loadgroup --no-loadscope-reorder
 
 .PHONY: help run test tests test-newest newest run-newest strict-run environment test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
-.PHONY: kills mutants golden golden-quick lock clean
+.PHONY: kills mutants golden golden-quick lock audit look clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -44,6 +45,7 @@ help:
 	@echo "make lint             lint, types, import contract"
 	@echo "make format           format the code"
 	@echo "make lock             pin the dependencies again (needs uv)"
+	@echo "make audit            are there known holes in a pinned package? Needs a package index; CI: once a week"
 	@echo "make clean            remove the environment and every cache; runs/ stays"
 	@echo
 	@echo "Programs that are started by hand, in $(VENV)/bin; --help and the first lines of each file say more:"
@@ -184,12 +186,26 @@ $(VENV)/.installed-dev: requirements-dev.lock $(VENV)/.installed
 # package for all Pythons (--fork-strategy fewest), so that types are checked against and numbers come from the same numpy.
 UV ?= uv
 LOCK_ARGS ?=
-UV_COMPILE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-index-url --no-emit-find-links \
-	--fork-strategy fewest --python-version 3.11 --custom-compile-command "make lock" $(LOCK_ARGS) --group build pyproject.toml
+UV_COMPILE_ONE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-index-url --no-emit-find-links \
+	--fork-strategy fewest --python-version 3.11 --custom-compile-command "make lock" $(LOCK_ARGS)
+UV_COMPILE = $(UV_COMPILE_ONE) --group build pyproject.toml
 
 lock:
 	$(UV_COMPILE) --output-file requirements.lock
 	$(UV_COMPILE) --group dev --all-extras --constraint requirements.lock --output-file requirements-dev.lock
+	$(UV_COMPILE_ONE) --group pyproject.toml:audit --constraint requirements-dev.lock --output-file requirements-audit.lock
+
+# In an environment of its own. A package that the index does not know is a failure (--strict): it was not looked at.
+audit:
+	@$(MAKE) --no-print-directory VENV=$(AUDIT_VENV) look
+
+look: $(VENV)/.installed-audit
+	@for lock in requirements-dev.lock requirements-audit.lock; do echo "ccatp: looking for known holes in $$lock"; \
+		$(BIN)/pip-audit --strict --disable-pip --require-hashes --progress-spinner off --requirement $$lock || exit 1; done
+
+$(VENV)/.installed-audit: requirements-audit.lock | $(BIN)/python
+	@$(PIP) install --no-compile --require-hashes --no-deps --prefer-binary -r requirements-audit.lock
+	@touch $@
 
 clean:
 	rm -rf $(VENV) $(NEWEST_VENV) $(RUN_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
