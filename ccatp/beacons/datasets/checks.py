@@ -87,6 +87,8 @@ def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     keep = np.ones(x.size, dtype=bool)
     slope, offset = 1.0, 0.0
     for _ in range(5):
+        if keep.sum() < FEW or np.ptp(x[keep]) == 0.0:  # most rows are far from any line
+            break
         slope, offset = np.polyfit(x[keep], y[keep], 1).tolist()
         residual = y - slope * x - offset
         sigma = MANY_SIGMA * float(np.median(np.abs(residual - np.median(residual))))
@@ -182,15 +184,24 @@ FASTEST_M_S = 50.0
 
 
 def suspicions(run: RecordedRun) -> list[str]:
-    """All warnings, the most basic first."""
-    found = [*_gaps(run), *_units(run), *_signs(run.readings)]
-    if run.truth is not None:
-        against = list(_standing(run.truth, run.steps)) or list(_odometry_against(run.truth, run.steps))
-        found += against
-        if not any(line.startswith("the truth never moves") for line in against):
-            found += readings_against(run, run.truth)
-    found += _map_of(run)
+    """All warnings, the most basic first. A check that fails on strange data gives a warning that says so."""
+    found: list[str] = []
+    for check in (_gaps, _units, _signs, _against_truth, _map_of):
+        try:
+            found += check(run)
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+            what = check.__name__.strip("_").replace("_", " ")
+            found.append(f"the check of {what} cannot be made on these data ({' '.join(str(error).split())[:80]})")
     return found
+
+
+def _against_truth(run: RecordedRun) -> Iterator[str]:
+    if run.truth is None:
+        return
+    against = list(_standing(run.truth, run.steps)) or list(_odometry_against(run.truth, run.steps))
+    yield from against
+    if not any(line.startswith("the truth never moves") for line in against):
+        yield from readings_against(run, run.truth)
 
 
 def _gaps(run: RecordedRun) -> Iterator[str]:
@@ -235,7 +246,8 @@ def _units(run: RecordedRun) -> Iterator[str]:
             yield f"truth turns {turned / by_odometry:.0f} times as much as the odometry: is its heading in degrees?"
 
 
-def _signs(readings: Readings) -> Iterator[str]:
+def _signs(run: RecordedRun) -> Iterator[str]:
+    readings = run.readings
     negative = int((readings.range_m < 0.0).sum())
     if negative:
         yield f"{plural(negative, 'range')} below zero"

@@ -12,9 +12,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError
 
-from ccatp.beacons.datasets.formats import run_of_events
+from ccatp.beacons.datasets.events import Recording, name_of
 from ccatp.beacons.datasets.tables import RadioDataError, tables_of
-from ccatp.beacons.estimation.recording import RecordedRun
 from ccatp.config.files import read_input
 from ccatp.config.models import Model
 from ccatp.kinematics import wrap_pi
@@ -59,7 +58,7 @@ class Topics(Model):
     beacons: dict[str, _Place] = Field(default_factory=dict)
 
 
-def read_bag(path: Path, topics_file: Path | None) -> RecordedRun:
+def read_bag(path: Path, topics_file: Path | None) -> Recording:
     """Read a run. Times are those of the message headers, or of the recorder for messages without one.
 
     Raises RadioDataError: rosbags is not installed, or the bag or its topics are invalid.
@@ -73,7 +72,7 @@ def read_bag(path: Path, topics_file: Path | None) -> RecordedRun:
         rows.append(("beacon", 0, [_number(numbers, name), *place, *[np.nan] * (3 - len(place))]))
     if any(topics.antenna_m):
         rows.append(("antenna", 0, [*topics.antenna_m, *[0.0] * (3 - len(topics.antenna_m))]))
-    return run_of_events(path, tables_of(path, rows), tuple(numbers))
+    return Recording(path, name_of(path), "csv", tables_of(path, rows), tuple(numbers))
 
 
 def read_topics(file: Path) -> Topics:

@@ -29,6 +29,7 @@ MOST_DATA_BYTES = 50_000_000  # against decompression bombs; the longest known r
 LONGEST_ROW = 20_000  # characters
 GZIP_MAGIC = b"\x1f\x8b"
 COMMENTS = ("#", "%", "//")
+UNOMITTABLE = ("time_s", "time [s]", "x_m", "y_m", "forward_m", "left_m")  # columns that no cell may leave empty
 GAP_S = 2.0  # shorter pauses are normal for recorders,
 GAP_RATIO = 20.0  # and so are pauses of fewer usual intervals
 
@@ -83,7 +84,7 @@ def split_cells(content: str, delimiter: str | None = ",") -> list[str]:
 
 
 def number(file: Path, line: int, text: str, what: str) -> float:
-    """A number; NaN and infinity are accepted, and ``Table.in_order`` drops their rows with a warning.
+    """A number; NaN and infinity are accepted, and ``Table.finite`` drops their rows with a warning.
 
     Raises RadioDataError: it is not a number.
     """
@@ -114,49 +115,26 @@ class Table(NamedTuple):
         first = int(self.lines[np.flatnonzero(rows)[0]])
         return f"{self.file.name}:{first}: {plural(int(rows.sum()), 'row')} {what}"
 
+    def where(self, rows: BoolArray) -> "Table":
+        """The rows of a mask (n,)."""
+        return Table(self.file, self.values[rows], self.lines[rows])
+
     def finite(self, warnings: list[str], columns: int | None = None) -> "Table":
         """Rows that are finite in the first ``columns`` (default: all); the others are dropped with a warning."""
         finite = np.asarray(np.isfinite(self.values[:, :columns]).all(axis=1))
         if not finite.all():
             warnings.append(self.note(~finite, "not finite (the first here), not used"))
-        return Table(self.file, self.values[finite], self.lines[finite])
-
-    def in_order(self, warnings: list[str], columns: int | None = None) -> "Table":
-        """Finite rows sorted by time (column 0) without duplicates; warns of unsorted and duplicate rows.
-
-        Rows that are equal in every column count once; different rows of the same time all stay, in their order.
-        """
-        file, values, lines = self.finite(warnings, columns)
-        back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
-        if back.size:
-            warnings.append(
-                f"{file.name}:{int(lines[back[0] + 1])}: time goes back {plural(back.size, 'time')} (the first here, "
-                f"by {values[back[0], 0] - values[back[0] + 1, 0]:.6g} s); rows were sorted by time"
-            )
-            order = np.argsort(values[:, 0], kind="stable")
-            values, lines = values[order], lines[order]
-        keep = np.ones(len(values), dtype=bool)
-        for row in (np.flatnonzero(np.diff(values[:, 0]) == 0.0) + 1).tolist():
-            first = int(np.searchsorted(values[:, 0], values[row, 0]))
-            keep[row] = not any(np.array_equal(values[k], values[row], equal_nan=True) for k in range(first, row))
-        if not keep.all():
-            warnings.append(Table(file, values, lines).note(~keep, "doubled (the first here), not used"))
-        return Table(file, values[keep], lines[keep])
+        return self.where(finite)
 
     def with_unknown_ways(self, warnings: list[str]) -> "Table":
         """Incremental odometry: a row with a time but other values not finite keeps its time, the rest becomes NaN."""
         unknown = np.isfinite(self.values[:, 0]) & ~np.isfinite(self.values).all(axis=1)
         if not unknown.any():
             return self
-        warnings.append(self.note(unknown, "not finite (the first here): the way there is guessed by the speed before"))
+        warnings.append(self.note(unknown, "not finite (the first here): the way there is not measured"))
         values = self.values.copy()
         values[unknown, 1:] = np.nan
         return self._replace(values=values)
-
-    def check_steps(self, what: str) -> None:
-        """Raises RadioDataError: the odometry has fewer than three rows."""
-        if len(self.values) < 3:
-            raise RadioDataError(self.file, f"{len(self.values)} {what}: too few for a run")
 
 
 def tables_of(file: Path, rows: Iterable[tuple[str, int, list[float]]]) -> dict[str, Table]:
@@ -202,19 +180,21 @@ def tagged_row(
     if kind not in layout:
         raise RadioDataError(file, f"{kind!r} is none of {', '.join(layout)}", line)
     columns = layout[kind]
-    while len(cells) > 1 and not cells[-1]:
+    while len(cells) > max(1, needed_of(columns)) and not cells[-1]:
         cells.pop()  # empty cells at the end, as spreadsheets write them
     if not needed_of(columns) <= len(cells) <= len(columns):
         raise RadioDataError(file, f"{len(cells)} values after {kind}, wanted {', '.join(columns)}", line)
     values = []
     for cell, column in zip(cells, columns, strict=False):
         if column != "beacon":
-            values.append(number(file, line, cell, column.strip("()")))
+            # Nothing was measured; a row without a time or a place means nothing.
+            is_nothing = not cell and column not in UNOMITTABLE
+            values.append(np.nan if is_nothing else number(file, line, cell, column.strip("()")))
         elif cell:
             values.append(names.setdefault(cell, float(len(names))))
         else:
             raise RadioDataError(file, f"{kind} has no name of a beacon", line)
-    missing = 0.0 if kind == "odom" else np.nan  # no travel sideways; heading unknown
+    missing = 0.0 if kind in {"odom", "speed"} else np.nan  # no travel sideways; heading unknown
     return kind, line, values + [missing] * (len(columns) - len(values))
 
 

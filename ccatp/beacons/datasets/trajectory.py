@@ -15,6 +15,9 @@ CHORD_M = 0.2
 LONGEST_WAY_M = 1e6  # longer paths are impossible for a vehicle and are not cut into chords
 AGREEMENT = 0.8  # length of the mean vector of (course - heading) above which the two differ by a constant
 LARGEST_SIDESLIP_RAD = 0.3  # a smaller constant difference is sideslip; a larger one is an error of the reference
+CONSTANT_RAD = 1e-6  # span of a heading that never changes
+TURNED_RAD = 0.5  # by the odometry meanwhile
+STRAIGHT = 0.95  # length of the mean vector of the course above which the path does not turn
 PIECE_S = 10.0  # long enough for one or two turns, short enough for the drift of odometry
 PIECE_POINTS = 40
 LEAST_PIECES = 4
@@ -29,12 +32,9 @@ def amount_at(steps: Steps, amounts: FloatArray | float, times_s: FloatArray) ->
     return found
 
 
-def steps_of_speeds(t: FloatArray, speed: FloatArray, rate: FloatArray, side: FloatArray) -> Steps:
-    """Steps from speeds, m/s and rad/s, each shape (n,); a row holds until the next, and of equal times the last."""
-    interval_s = np.diff(t)
-    later = interval_s > 0.0
-    distance, turn, lateral = ((column[:-1] * interval_s)[later] for column in (speed, rate, side))
-    return bridged(Steps(np.concatenate([t[:-1][later], t[-1:]]), distance, turn, lateral))
+def way_at(steps: Steps, times_s: FloatArray) -> FloatArray:
+    """Length of the way until each time, m; the shape of ``times_s``."""
+    return amount_at(steps, np.hypot(steps.distance_m, steps.lateral_m), times_s)
 
 
 def bridged(steps: Steps) -> Steps:
@@ -107,31 +107,45 @@ def chords(truth: ReferencePath, steps: Steps) -> npt.NDArray[np.int64]:
     return np.asarray(rows[np.unique(np.minimum(np.searchsorted(way, marks), rows.size - 1))])
 
 
-def checked_heading(truth: ReferencePath, steps: Steps, warnings: list[str]) -> ReferencePath:
+def checked_heading(truth: ReferencePath, steps: Steps, warnings: list[str], *, turns: bool = True) -> ReferencePath:
     """The truth with its heading along the course; if it is not, it is rotated with a warning.
 
-    Course and heading of a moving vehicle differ by its sideslip; a large constant difference means that the reference
-    measures the heading from another direction.
+    Course and heading differ by the direction in which the odometry moves, and by its sideslip; a large constant rest
+    means that the reference measures the heading from another direction. A heading that never changes while the course
+    turns is none. ``turns``: whether to rotate it; else there is only the warning.
     """
     if not np.isfinite(truth.heading_rad).any():
         return truth
     rows = chords(truth, steps)
     if rows.size < 4:
         return truth
+    t = truth.times_s[rows]
     course = np.arctan2(np.diff(truth.y_m[rows]), np.diff(truth.x_m[rows]))
+    by_odometry_rad = float(np.ptp(running_total(steps.turn_rad)))
+    is_constant = float(np.ptp(truth.heading_rad)) < CONSTANT_RAD and by_odometry_rad > TURNED_RAD
+    if is_constant and abs(np.mean(np.exp(1j * course))) < STRAIGHT:
+        warnings.append(
+            f"the truth has no heading: it is {truth.heading_rad[0]:.3g} rad throughout, while its course turns; it is "
+            "not used"
+        )
+        return truth._replace(heading_rad=np.full(len(truth.times_s), np.nan))
     heading = 0.5 * (truth.heading_rad[rows[1:]] + truth.heading_rad[rows[:-1]])
-    way = np.diff(amount_at(steps, steps.distance_m, truth.times_s[rows]))
-    rolls = np.abs(way) > 0.5 * CHORD_M  # by odometry too, to exclude jumps of the reference
+    ahead_m, left_m = (np.diff(amount_at(steps, column, t)) for column in (steps.distance_m, steps.lateral_m))
+    way_m = np.hypot(ahead_m, left_m)
+    rolls = way_m > 0.5 * CHORD_M  # by odometry too, to exclude jumps of the reference
     if rolls.sum() < 4:
         return truth
-    vector = np.mean(np.exp(1j * (course - heading))[rolls] * np.sign(way[rolls]))
+    vector = np.mean(
+        np.exp(1j * (course - heading))[rolls] * ((ahead_m - 1j * left_m) / np.maximum(way_m, 1e-9))[rolls]
+    )
     turned = float(np.angle(vector))
     if abs(vector) < AGREEMENT or abs(turned) < LARGEST_SIDESLIP_RAD:
         return truth
     by = float(np.copysign(np.pi, turned)) if abs(turned) > np.pi - LARGEST_SIDESLIP_RAD else turned
     what = "pi" if abs(by) == np.pi else f"{by:.3f} rad"
-    warnings.append(f"truth heading is turned by {what} against the course; it was turned back")
-    return truth._replace(heading_rad=truth.heading_rad + by)
+    done = "it was turned back" if turns else "it is used as it is"
+    warnings.append(f"truth heading is turned by {what} against the course; {done}")
+    return truth._replace(heading_rad=truth.heading_rad + by) if turns else truth
 
 
 def turning_factor(truth: ReferencePath, steps: Steps) -> float | None:

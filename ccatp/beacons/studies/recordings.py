@@ -16,9 +16,10 @@ import numpy as np
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.cricket.measured_map import map_measured
+from ccatp.beacons.datasets.assembly import checked_run
 from ccatp.beacons.datasets.checks import survey_doubts
-from ccatp.beacons.datasets.formats import run_of_events
-from ccatp.beacons.datasets.reader import checked_run, read_run
+from ccatp.beacons.datasets.events import Recording
+from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
 from ccatp.beacons.datasets.tables import Table
 from ccatp.beacons.datasets.trajectory import pose_of_truth
@@ -166,9 +167,9 @@ def events_of(run: RecordedRun, begin_s: float, end_s: float) -> tuple[dict[str,
 
 def read_again(run: RecordedRun, tables: Mapping[str, Table], truth: ReferencePath | None) -> RecordedRun:
     """A run from tables of events, as read and checked by the reader without the truth, which is added afterwards."""
-    again = checked_run(run_of_events(Path(run.name), dict(tables), run.beacon_ids), Path(run.name))
+    again = checked_run(Recording(Path(run.name), run.name, run.kind, tables, run.beacon_ids))
     pose = pose_of_truth(truth, again.steps, [])
-    return replace(again, name=run.name, kind=run.kind, first_pose=pose, truth=truth, beacon_truth_m=run.beacon_truth_m)
+    return replace(again, first_pose=pose, truth=truth, beacon_truth_m=run.beacon_truth_m)
 
 
 # -- recordings -------------------------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
-from ccatp.beacons.datasets.formats import read_events_csv
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.estimation.causal import filter_run
@@ -89,7 +88,7 @@ def test_a_bag_is_the_run_that_its_csv_is(suffix: str, tmp_path: Path) -> None:
     topics = tmp_path / "topics.toml"
     topics.write_text(TOPICS)
     found = read_run(write_bag(tmp_path / f"run{suffix}", w), None, None, topics)
-    wanted = read_events_csv(write_lines(tmp_path / "run.csv", csv_lines(w)))
+    wanted = read_run(write_lines(tmp_path / "run.csv", csv_lines(w)), None, None)
     assert found.beacon_truth_m == {"6": BEACONS["6"]}
     assert set(found.beacon_ids) == set(BEACONS)
     np.testing.assert_allclose(found.steps.distance_m, wanted.steps.distance_m, atol=1e-5)

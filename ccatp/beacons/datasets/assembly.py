@@ -1,0 +1,270 @@
+"""From the recording of any format to a run for the estimators: the one path that every reader goes through."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ccatp.beacons.datasets.checks import suspicions
+from ccatp.beacons.datasets.events import EVENTS, MOTIONS, READING_KINDS, Recording
+from ccatp.beacons.datasets.ordering import ordered
+from ccatp.beacons.datasets.placeholders import frozen, measured, true_positions, without_wild_steps
+from ccatp.beacons.datasets.tables import RadioDataError, Table, long_pauses, needed_of, plural, within
+from ccatp.beacons.datasets.trajectory import (
+    BEFORE_S,
+    at_antenna,
+    bridged,
+    checked_heading,
+    pose_of_truth,
+    way_at,
+)
+from ccatp.beacons.estimation.recording import Readings, RecordedRun, ReferencePath, Steps
+from ccatp.core import FloatArray
+
+LEAST_STEPS = 2
+LEAST_TRUTH = 2  # rows; a single position fits any path
+LARGEST = {1: (1e3, "a step forward", "m"), 2: (1e4, "a turn", "rad"), 3: (1e3, "a step to the left", "m")}
+FARTHEST_M = 1e8  # of coordinates; those of maps reach 1e7
+EARLY_SHARE = 0.1  # of the run; a first part of it that is shorter than the gap behind it is not used
+LATE_TRUTH_S, LATE_SHARE = 1.0, 0.5  # the run begins with the truth if that begins later, but within this share
+STILL_M, STILL_RAD = 0.1, 0.05  # unless the vehicle stands until then
+
+
+def checked_run(recording: Recording, *, turns_heading: bool = True) -> RecordedRun:
+    """The run of a recording, ordered, without what cannot be, with a warning of each kind that was left out.
+
+    ``turns_heading``: whether a heading of the truth that is turned against its course is corrected, or only reported.
+    Raises RadioDataError: there is no odometry or no reading of a beacon.
+    """
+    with np.errstate(all="ignore"):  # numbers that overflow are left out below
+        return _checked(recording, turns_heading)
+
+
+def _checked(recording: Recording, turns_heading: bool) -> RecordedRun:
+    file, names, warnings = recording.file, recording.names, list(recording.warnings)
+    tables = dict(recording.tables)
+    surveyed, mounted = tables.pop("beacon", None), tables.pop("antenna", None)
+    _check_complete(recording)
+    tables = {kind: _usable(kind, table, warnings) for kind, table in tables.items()}
+    tables = ordered({kind: table for kind, table in tables.items() if len(table.values)}, warnings)
+    truth_rows = true_positions(tables["truth"], "truth", warnings) if "truth" in tables else None
+    odometry = without_wild_steps(_motions(recording, tables), warnings)
+    odometry = _with_truth(_known_part(odometry, warnings), truth_rows, warnings)
+    _check_steps(odometry)
+    steps = bridged(Steps(odometry.values[:, 0], *(odometry.values[1:, column] for column in (1, 2, 3))))
+    readings, beacon_ids = _readings(recording, tables, steps, warnings)
+    truth = _truth(truth_rows, steps, warnings, turns_heading)
+    first_pose = pose_of_truth(truth, steps, warnings)
+    if truth is not None and len(truth.times_s) < LEAST_TRUTH:
+        warnings.append(
+            f"no reference trajectory: the truth has {plural(len(truth.times_s), 'row')}, good for the first pose "
+            "alone; errors of the path stay unknown"
+        )
+        truth = None
+    places_m, heights_m = _survey(surveyed, names, warnings)
+    ahead_m, left_m, up_m = _antenna(mounted)
+    above_m = np.array([heights_m.get(beacon, np.nan) - up_m for beacon in beacon_ids])
+    readings = _in_the_plane(readings, np.nan_to_num(above_m), warnings)
+    if not len(readings.times_s):
+        raise RadioDataError(file, f"none of its readings can be used ({'; '.join(warnings[-3:])})")
+    if ahead_m or left_m:
+        steps, truth, first_pose = at_antenna(steps, truth, first_pose, (ahead_m, left_m), warnings)
+    run = RecordedRun(
+        recording.name, recording.kind, steps, readings, beacon_ids, places_m, truth, first_pose, (),
+        (ahead_m, left_m),
+    )  # fmt: skip
+    # A row with two readings gives the same warning of each.
+    return replace(run, warnings=tuple(dict.fromkeys((*warnings, *suspicions(run)))))
+
+
+def _usable(kind: str, table: Table, warnings: list[str]) -> Table:
+    if kind in MOTIONS:
+        return table.with_unknown_ways(warnings).finite(warnings, 1)
+    return table.finite(warnings, needed_of(EVENTS[kind]))
+
+
+def _check_complete(recording: Recording) -> None:
+    file, tables = recording.file, recording.tables
+    if not any(kind in tables for kind in MOTIONS):
+        raise RadioDataError(file, f"no event odom ({', '.join(EVENTS['odom'])}); see docs/radio_data.md")
+    if not any(kind in tables for kind in READING_KINDS):
+        raise RadioDataError(
+            file, f"no readings of beacons: no event {', '.join(READING_KINDS)}; see docs/radio_data.md"
+        )
+
+
+def _motions(recording: Recording, tables: dict[str, Table]) -> Table:
+    """Rows of time and of the motion since the row before, shape (n, 4); those of the first row mean nothing."""
+    if "odom" in tables:
+        odometry = tables["odom"]
+    elif "speed" in tables:  # a speed holds until the next row
+        file, values, lines = tables["speed"]
+        moves = values[:-1, 1:] * np.diff(values[:, 0])[:, None]
+        odometry = Table(file, np.column_stack([values[:, 0], np.vstack([np.zeros((1, 3)), moves])]), lines)
+    else:
+        raise RadioDataError(recording.file, "no row of the odometry has a time")
+    if len(odometry.values) <= LEAST_STEPS:
+        raise RadioDataError(odometry.file, f"{plural(len(odometry.values), 'row')} of odometry: too few for a run")
+    return odometry
+
+
+def _known_part(odometry: Table, warnings: list[str]) -> Table:
+    """The odometry from where to where its motion is known.
+
+    Before the first motion that was measured there is none from which to guess an unknown one; a short first part
+    before a longer gap is left out with it.
+    """
+    t = odometry.values[:, 0]
+    unknown = np.asarray(np.isnan(odometry.values[1:, 1:]).any(axis=1))
+    unknown[long_pauses(t)] = True
+    known = np.flatnonzero(~unknown)
+    if not known.size:
+        raise RadioDataError(odometry.file, "no motion of the odometry is known")
+    first, last = int(known[0]), int(known[-1]) + 1
+    for row in (np.flatnonzero(np.diff(known) > 1) + 1).tolist():  # the first known step after each gap
+        gap_begin_s, gap_end_s = t[known[row - 1] + 1], t[known[row]]
+        early_s = min(max(gap_end_s - gap_begin_s, BEFORE_S), EARLY_SHARE * (t[last] - t[first]))
+        if gap_begin_s - t[first] >= early_s:
+            break
+        first = int(known[row])
+    for what, row in (("begins", first), ("ends", last)):
+        if row not in {0, len(t) - 1}:
+            warnings.append(
+                f"{odometry.file.name}:{int(odometry.lines[row])}: the run {what} here, at {t[row]:.6g} s: the motion "
+                f"{'before' if what == 'begins' else 'after'} is not known"
+            )
+    return _part(odometry, first, last)
+
+
+def _with_truth(odometry: Table, truth: Table | None, warnings: list[str]) -> Table:
+    """The odometry from the first row of the truth on, if the vehicle moves before: its first pose is not known."""
+    t, last = odometry.values[:, 0], len(odometry.values) - 1
+    if truth is None or not LATE_TRUTH_S < truth.values[0, 0] - t[0] < LATE_SHARE * (t[-1] - t[0]):
+        return odometry
+    begin = int(np.searchsorted(t, truth.values[0, 0]))
+    before = odometry.values[1 : begin + 1, 1:]
+    if np.nansum(np.hypot(before[:, 0], before[:, 2])) < STILL_M and np.nansum(np.abs(before[:, 1])) < STILL_RAD:
+        return odometry
+    warnings.append(
+        f"the truth begins {truth.values[0, 0] - t[0]:.6g} s after the odometry, while the vehicle moves: the run "
+        f"begins with it, at {t[begin]:.6g} s"
+    )
+    return _part(odometry, begin, last)
+
+
+def _part(odometry: Table, first: int, last: int) -> Table:
+    if last - first < LEAST_STEPS:
+        raise RadioDataError(odometry.file, "too little of the odometry is known for a run")
+    return Table(odometry.file, odometry.values[first : last + 1], odometry.lines[first : last + 1])
+
+
+def _check_steps(odometry: Table) -> None:
+    """Raises RadioDataError: a step that no vehicle makes, of a run with more of them."""
+    for column, (most, what, unit) in LARGEST.items():
+        values = odometry.values[1:, column]
+        beyond = np.abs(values) > most
+        if beyond.any():
+            at = int(np.argmax(beyond))
+            raise RadioDataError(
+                odometry.file,
+                f"odometry: {what} of {values[at]:.3g} {unit} at {odometry.values[at + 1, 0]:.6g} s cannot be; at most "
+                f"{most:g} is taken; see the units in docs/radio_data.md",
+                int(odometry.lines[at + 1]),
+            )
+
+
+def _readings(
+    recording: Recording, tables: dict[str, Table], steps: Steps, warnings: list[str]
+) -> tuple[Readings, tuple[str, ...]]:
+    """Readings with range, bearing and strength of one beacon at one time in one row, and the names of the beacons."""
+    merged: dict[tuple[float, float], list[float]] = {}
+    extra: list[tuple[float, float, list[float]]] = []
+    spans = []
+    for place, kind in enumerate(READING_KINDS):
+        if kind not in tables:
+            continue
+        table = measured(kind, tables[kind], warnings)
+        spans += table.values[:, 0].tolist()
+        table = table.where(within(table.values[:, 0], steps.times_s, kind, warnings))
+        table = frozen(kind, table, way_at(steps, table.values[:, 0]), recording.names, warnings)
+        for t, who, value in table.values.tolist():
+            row = merged.setdefault((t, who), [np.nan] * len(READING_KINDS))
+            if np.isnan(row[place]):
+                row[place] = value
+            else:  # a second value of this kind at the same time
+                extra.append((t, who, [value if k == place else np.nan for k in range(len(READING_KINDS))]))
+    if not merged:
+        raise RadioDataError(recording.file, _no_readings(spans, steps, warnings))
+    rows = sorted([(t, who, row) for (t, who), row in merged.items()] + extra, key=lambda item: item[0])
+    beacons, index = np.unique([int(who) for _, who, _ in rows], return_inverse=True)
+    data = np.array([row for _, _, row in rows]).reshape(-1, len(READING_KINDS))
+    readings = Readings(np.array([t for t, _, _ in rows]), index.astype(np.int64), *data.T.copy())
+    return readings, tuple(recording.names[int(who)] for who in beacons)
+
+
+def _no_readings(times_s: list[float], steps: Steps, warnings: list[str]) -> str:
+    if not times_s:
+        return f"none of its readings can be used ({'; '.join(warnings[-3:])})"
+    return (
+        f"no readings of beacons within the time of the odometry, {steps.times_s[0]:.6g} to {steps.times_s[-1]:.6g} s: "
+        f"theirs are {min(times_s):.6g} to {max(times_s):.6g} s; are both in s, and of one clock?"
+    )
+
+
+def _truth(reference: Table | None, steps: Steps, warnings: list[str], turns_heading: bool) -> ReferencePath | None:
+    """The trajectory from rows of time, x, y and heading; without headings if one is missing."""
+    if reference is None:
+        return None
+    far = np.asarray(~(np.abs(reference.values[:, 1:3]) <= FARTHEST_M).all(axis=1))
+    if far.any():
+        warnings.append(reference.note(far, f"of truth beyond {FARTHEST_M:g} m (the first here), not used"))
+        reference = reference.where(~far)
+    if not len(reference.values):
+        return None
+    t, x, y, heading = reference.values.T
+    known = np.isfinite(heading)
+    if known.any() and not known.all():
+        warnings.append(reference.note(~known, "of truth without heading (the first here): no heading is used"))
+    heading = np.unwrap(heading) if known.all() else np.full(len(t), np.nan)
+    return checked_heading(ReferencePath(t, x, y, heading), steps, warnings, turns=turns_heading)
+
+
+def _survey(
+    surveyed: Table | None, names: tuple[str, ...], warnings: list[str]
+) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
+    """Surveyed positions and heights by name. Raises RadioDataError: one beacon has two positions."""
+    places_m: dict[str, tuple[float, float]] = {}
+    heights_m: dict[str, float] = {}
+    if surveyed is None:
+        return places_m, heights_m
+    for line, (index, x_m, y_m, z_m) in zip(surveyed.lines.tolist(), surveyed.values.tolist(), strict=True):
+        name = names[int(index)]
+        if not (abs(x_m) <= FARTHEST_M and abs(y_m) <= FARTHEST_M):
+            warnings.append(f"surveyed place of {name}: is no place within {FARTHEST_M:g} m, not used")
+            continue
+        if places_m.setdefault(name, (x_m, y_m)) != (x_m, y_m):
+            raise RadioDataError(surveyed.file, f"beacon {name} was surveyed at another place before", line)
+        heights_m[name] = z_m
+    return places_m, heights_m
+
+
+def _antenna(mounted: Table | None) -> tuple[float, float, float]:
+    if mounted is None:
+        return 0.0, 0.0, 0.0
+    if len(mounted.values) > 1 or not np.isfinite(mounted.values[0, :2]).all():
+        raise RadioDataError(mounted.file, "more than one antenna, or one at no place", int(mounted.lines[-1]))
+    ahead_m, left_m, up_m = np.nan_to_num(mounted.values[0]).tolist()
+    return ahead_m, left_m, up_m
+
+
+def _in_the_plane(readings: Readings, above_m: FloatArray, warnings: list[str]) -> Readings:
+    """Ranges projected to the plane. ``above_m``: height of each beacon above the antenna, shape (b,)."""
+    squares = readings.range_m**2 - above_m[readings.beacon] ** 2
+    if (short := (squares < 0.0) & (readings.range_m > 0.0)).any():
+        warnings.append(
+            f"{plural(int(short.sum()), 'range')} shorter than the beacon is above the antenna, not used, the first at "
+            f"{readings.times_s[int(np.argmax(short))]:.6g} s"
+        )
+        readings = readings.where(~short)
+        squares = squares[~short]
+    level_m = np.where(above_m[readings.beacon] == 0.0, readings.range_m, np.sqrt(np.maximum(squares, 0.0)))
+    return readings._replace(range_m=level_m)

@@ -1,0 +1,178 @@
+"""What stands in a recording in place of a measurement: values that mean "nothing", poses of zero, wild steps."""
+
+import numpy as np
+
+from ccatp.beacons.datasets.tables import Table, plural
+from ccatp.beacons.estimation.recording import BoolArray
+from ccatp.core import FloatArray
+
+# Values that units write without an answer, and end values of 16 bits in mm and cm.
+KNOWN = {
+    "range": (65.535, 655.35, 65535.0, 99.99, 999.0, 999.9, 999.99, 9999.0, 9999.99),
+    "rssi": (-128.0, -127.0, -120.0, -100.0, 0.0, 100.0, 127.0),
+}
+NOTHING = {"range": (0.0, -1.0)}  # never a measurement
+LIMITS = {"range": (1e6, "m"), "bearing": (1e4, "rad"), "rssi": (1e3, "dBm")}
+WHAT = {"range": "range", "bearing": "bearing", "rssi": "signal strength"}
+LEAST_OTHERS = 10  # other values from which it can be told what is usual
+APART = 0.25  # of the span of the other values, beyond which an end value stands apart
+LEAST_APART = {"range": 1.0, "rssi": 5.0}
+OFTEN = 3  # equal values that stand apart and are no known placeholder
+OFTEN_AT_END, TIMES_OTHERS = 6, 3.0  # equal end values that do not stand apart, and how much more often than any other
+FROZEN = 12  # equal readings of one beacon in a row while the vehicle moves
+FROZEN_M = 1.0
+
+FASTER = 10.0  # times the usual rate of the run
+USUAL = 90.0  # percentile of the rates in motion
+MOVING = 1e-3  # m/s or rad/s
+# Column of the odometry, name, unit, smallest step and rate that can be wild.
+MOTIONS = ((1, "forward", "m", 0.2, 1.0), (2, "to turn", "rad", 0.5, 3.0), (3, "to the left", "m", 0.2, 1.0))
+MOST_WILD = 0.02  # share of the rows; more are the run's own
+
+ZERO_M = 0.5  # distance of the neighbours, from which a position of zero is none
+ZERO_STEPS = 20.0  # the same, in usual steps of the reference
+SPIKE = 5.0  # times the distance of the neighbours
+
+
+def measured(kind: str, table: Table, warnings: list[str]) -> Table:
+    """The readings of one kind, shape (n, 3): time, beacon, value; without values that were not measured."""
+    values = table.values[:, 2]
+    most, unit = LIMITS[kind]
+    beyond = ~(np.abs(values) <= most)
+    if beyond.any():
+        first = int(np.argmax(beyond))
+        line = f"beyond {most:g} {unit}, the first {values[first]:.3g} {unit} at {table.values[first, 0]:.6g} s"
+        warnings.append(f"{plural(int(beyond.sum()), WHAT[kind])} {line}, not used")
+        table = table.where(~beyond)
+    for value in _placeholders(kind, table.values[:, 1], table.values[:, 2]):
+        is_it = table.values[:, 2] == value
+        first = int(np.argmax(is_it))
+        warnings.append(
+            f"{plural(int(is_it.sum()), WHAT[kind])} of {value:.6g} {unit}, the first at "
+            f"{table.values[first, 0]:.6g} s ({table.file.name}:{int(table.lines[first])}), not used: "
+            "a placeholder, not a measurement"
+        )
+        table = table.where(~is_it)
+    return table
+
+
+def _placeholders(kind: str, beacons: FloatArray, values: FloatArray) -> list[float]:
+    found = [value for value in NOTHING.get(kind, ()) if (values == value).any()]
+    if kind not in KNOWN:
+        return found
+    ends = (np.min, np.max)
+    left = ~np.isin(values, found)
+    for end in (*ends, *ends):  # two at either end
+        if left.sum() < LEAST_OTHERS:
+            break
+        value = float(end(values[left]))
+        if _is_placeholder(kind, value, beacons[left], values[left]):
+            found.append(value)
+            left &= values != value
+    return found
+
+
+def _is_placeholder(kind: str, value: float, beacons: FloatArray, values: FloatArray) -> bool:
+    is_it = values == value
+    others, count = values[~is_it], int(is_it.sum())
+    if others.size < LEAST_OTHERS:
+        return False
+    span = float(np.ptp(np.percentile(others, (5.0, 95.0))))
+    apart = float(np.abs(others - value).min())
+    if apart > max(APART * span, LEAST_APART[kind]) and (value in KNOWN[kind] or count >= OFTEN):
+        return True
+    if count < OFTEN_AT_END or (np.unique(beacons).size > 1 and np.unique(beacons[is_it]).size == 1):
+        return False
+    return count > TIMES_OTHERS * float(np.unique(others, return_counts=True)[1].max())
+
+
+def frozen(kind: str, table: Table, way_m: FloatArray, names: tuple[str, ...], warnings: list[str]) -> Table:
+    """The readings without those that repeat the one before again and again while the vehicle moves.
+
+    ``way_m``: travelled until each reading, shape (n,).
+    """
+    stale = np.zeros(len(table.values), dtype=bool)
+    for beacon in np.unique(table.values[:, 1]).tolist():
+        rows = np.flatnonzero(table.values[:, 1] == beacon)
+        edges = np.flatnonzero(np.diff(table.values[rows, 2]) != 0.0) + 1
+        for first, stop in zip([0, *edges.tolist()], [*edges.tolist(), rows.size], strict=True):
+            run = rows[first:stop]
+            if run.size >= FROZEN and way_m[run[-1]] - way_m[run[0]] > FROZEN_M:
+                stale[run[1:]] = True
+                begin_s, value = table.values[run[0], [0, 2]].tolist()
+                warnings.append(
+                    f"{table.file.name}:{int(table.lines[run[1]])}: {WHAT[kind]} of beacon {names[int(beacon)]} "
+                    f"repeats {value:.6g} {run.size} times from {begin_s:.6g} s on, while the vehicle travels "
+                    f"{way_m[run[-1]] - way_m[run[0]]:.3g} m: used once"
+                )
+    return table.where(~stale) if stale.any() else table
+
+
+def without_wild_steps(odometry: Table, warnings: list[str]) -> Table:
+    """The odometry, shape (n, 4), with steps far beyond the run's own as unknown motions."""
+    if len(odometry.values) < LEAST_OTHERS:
+        return odometry
+    interval_s = np.diff(odometry.values[:, 0])
+    interval_s = np.maximum(interval_s, np.median(interval_s))
+    wild = np.zeros(len(odometry.values), dtype=bool)
+    for column, what, unit, least, least_rate in MOTIONS:
+        step = np.abs(odometry.values[1:, column])
+        rate = step / interval_s
+        moving = rate[rate > MOVING]
+        if moving.size < LEAST_OTHERS:
+            continue
+        most = max(FASTER * float(np.percentile(moving, USUAL)), least_rate)
+        beyond = (rate > most) & (step > least) & ~wild[1:]
+        if not 0 < beyond.sum() <= max(MOST_WILD * len(beyond), 1):
+            continue
+        first = int(np.argmax(beyond)) + 1
+        warnings.append(
+            f"{odometry.file.name}:{int(odometry.lines[first])}: {plural(int(beyond.sum()), 'step')} of the odometry "
+            f"{what} beyond what the run does otherwise (at most {most:.3g} {unit}/s is taken), the first of "
+            f"{odometry.values[first, column]:.3g} {unit} at {odometry.values[first, 0]:.6g} s: taken as a gap"
+        )
+        wild[1:] |= beyond
+    if not wild.any():
+        return odometry
+    values = odometry.values.copy()
+    values[wild, 1:] = np.nan
+    return odometry._replace(values=values)
+
+
+def true_positions(truth: Table, what: str, warnings: list[str]) -> Table:
+    """Rows of time, x and y without positions of zero far from their neighbours, and without single jumps."""
+    if len(truth.values) < LEAST_OTHERS:
+        return truth
+    at = truth.values[:, 1:3]
+    is_zero = (at == 0.0).all(axis=1)
+    if is_zero.any() and not is_zero.all():
+        rest = np.flatnonzero(~is_zero)
+        usual_m = float(np.median(np.hypot(*np.diff(at[rest], axis=0).T))) if rest.size > 1 else 0.0
+        after = rest[np.searchsorted(rest, np.flatnonzero(is_zero)).clip(0, rest.size - 1)]
+        before = rest[(np.searchsorted(rest, np.flatnonzero(is_zero)) - 1).clip(0)]
+        near_m = np.minimum(np.hypot(*at[after].T), np.hypot(*at[before].T))
+        is_zero[is_zero] = near_m > max(ZERO_M, ZERO_STEPS * usual_m)
+        if is_zero.any():
+            warnings.append(
+                truth.note(is_zero, f"of {what} at zero (the first here, at {_first_s(truth, is_zero)}), not used")
+            )
+            truth = truth.where(~is_zero)
+            at = truth.values[:, 1:3]
+    if len(at) < LEAST_OTHERS:
+        return truth
+    step_m = np.hypot(*np.diff(at, axis=0).T)
+    across_m = np.hypot(*(at[2:] - at[:-2]).T)
+    jump = np.zeros(len(at), dtype=bool)
+    jump[1:-1] = np.minimum(step_m[:-1], step_m[1:]) > SPIKE * (across_m + np.median(step_m)) + ZERO_M
+    if jump.any():
+        warnings.append(
+            truth.note(
+                jump, f"of {what} that jump there and back (the first here, at {_first_s(truth, jump)}), not used"
+            )
+        )
+        truth = truth.where(~jump)
+    return truth
+
+
+def _first_s(table: Table, rows: BoolArray) -> str:
+    return f"{table.values[int(np.argmax(rows)), 0]:.6g} s"

@@ -1,0 +1,233 @@
+"""The path of every reader: order and clocks, placeholders, unknown motions at either end, headings that are none."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.datasets.ordering import clock_sets
+from ccatp.beacons.datasets.reader import read_run
+from ccatp.beacons.estimation.recording import RecordedRun
+from tests.unit.beacons.datasets.sets import csv_lines, world, write_lines
+
+W = world(seconds=60.0)
+LINES = [line for line in csv_lines(W) if not line.startswith("bearing")]
+Change = Callable[[list[str]], list[str]]
+
+
+def in_time_order(lines: list[str]) -> list[str]:
+    """The lines as a recorder would write them: all kinds of events by time."""
+    head = [line for line in lines if line.split(",")[0] not in {"odom", "range", "truth"}]
+    timed = [line for line in lines if line.split(",")[0] in {"odom", "range", "truth"}]
+    return head + sorted(timed, key=lambda line: float(line.split(",")[1]))
+
+
+def read(tmp_path: Path, change: Change, *, turns_heading: bool = True) -> tuple[RecordedRun, str]:
+    file = write_lines(tmp_path / "mine.csv", change(in_time_order(LINES)))
+    run = read_run(file, None, None, turns_heading=turns_heading)
+    return run, " | ".join(run.warnings)
+
+
+def each(kind: str, change: Callable[[int, list[str]], list[str]]) -> Change:
+    """Changes the cells of all lines of a kind, by their number."""
+
+    def changed(lines: list[str]) -> list[str]:
+        found, count = [], 0
+        for line in lines:
+            is_its = line.startswith(f"{kind},")
+            found.append(",".join(change(count, line.split(","))) if is_its else line)
+            count += is_its
+        return found
+
+    return changed
+
+
+def with_value(kind: str, column: int, value: str, rows: Callable[[int], bool]) -> Change:
+    return each(kind, lambda k, cells: [*cells[:column], value, *cells[column + 1 :]] if rows(k) else cells)
+
+
+def clock_set(back_s: float, at_s: float = 40.0) -> Change:
+    def later(lines: list[str]) -> list[str]:
+        found = []
+        for line in lines:
+            cells = line.split(",")
+            if cells[0] in {"odom", "range", "truth"} and float(cells[1]) > at_s:
+                cells[1] = str(float(cells[1]) - back_s)
+            found.append(",".join(cells))
+        return found
+
+    return later
+
+
+def test_a_sound_recording_is_read_without_a_word_about_its_rows(tmp_path: Path) -> None:
+    _, said = read(tmp_path, list)
+    assert "not used" not in said
+    assert "clock" not in said
+
+
+@pytest.mark.parametrize("by_kind", [False, True])
+def test_a_clock_that_was_set_back_leaves_one_of_the_parts(tmp_path: Path, by_kind: bool) -> None:
+    def change(lines: list[str]) -> list[str]:
+        return (
+            sorted(clock_set(15.0)(lines), key=lambda line: line.split(",")[0]) if by_kind else clock_set(15.0)(lines)
+        )
+
+    run, said = read(tmp_path, change)
+    assert "odom: the clock was set back by 14.9 s at 40 s: of 2 parts only the one of 40 s from 0 s on is used" in said
+    assert run.steps.times_s[-1] == pytest.approx(40.0)
+    assert run.readings.times_s[-1] <= 40.0
+    assert run.readings.times_s.size == np.sum(W.read_s <= 40.0)
+    assert run.steps.distance_m.sum() == pytest.approx(W.distance_m[:400].sum())
+
+
+def test_a_clock_that_was_set_forward_by_days_leaves_the_part_with_most_rows(tmp_path: Path) -> None:
+    run, said = read(tmp_path, clock_set(-1e6, at_s=20.0))
+    assert "odometry pauses for 1e+06 s at 20 s: was the clock set? Only the part with most rows is used" in said
+    assert run.steps.times_s[0] == pytest.approx(1e6 + 20.1)
+
+
+@pytest.mark.parametrize(
+    ("times_s", "sets"),
+    [
+        (np.arange(100.0), []),
+        (np.r_[0:60, 50:100].astype(float), [60]),
+        (np.r_[0:60, 40:80, 55:99].astype(float), [60, 100]),
+        (np.r_[50:100, 0:50].astype(float), []),  # two halves in the wrong order
+        (np.r_[0:20, 25:28, 20:25, 28:50].astype(float), []),  # a block that was written late
+        (np.random.default_rng(1).permutation(100).astype(float), []),
+        (np.arange(100.0) + np.tile([0.0, 1.5], 50), []),  # two sources, one of them late
+    ],
+)
+def test_only_a_clock_is_set_where_two_ascending_parts_interleave(times_s: np.ndarray, sets: list[int]) -> None:
+    assert clock_sets(times_s) == sets
+
+
+def test_motions_of_equal_times_are_added_up_and_of_the_truth_the_last_counts(tmp_path: Path) -> None:
+    def change(lines: list[str]) -> list[str]:
+        row = next(k for k, line in enumerate(lines) if line.startswith("odom,30.0,"))
+        return [*lines[: row + 1], "odom,30.0,0.01,0.002", *lines[row + 1 :], "truth,60.0,7,8,9"]
+
+    run, said = read(tmp_path, change)
+    assert run.steps.distance_m[299] == pytest.approx(W.distance_m[299] + 0.01)
+    assert run.steps.turn_rad.sum() == pytest.approx(W.turn_rad.sum() + 0.002)
+    assert "1 row of odometry of the same time as the next (the first here), added up" in said
+    assert "1 row of truth of the same time as the next (the first here), the last one counts" in said
+    assert run.truth is not None
+    assert run.truth.x_m[-1] == 7.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "rows", "what"),
+    [
+        ("range", "0", lambda k: k % 20 == 3, "15 ranges of 0 m"),
+        ("range", "65.535", lambda k: k % 20 == 3, "15 ranges of 65.535 m, the first at "),
+        ("range", "65.535", lambda k: k == 3, "1 range of 65.535 m"),
+        ("range", "-1", lambda k: k % 20 == 3, "15 ranges of -1 m"),
+        ("range", "40.96", lambda k: k % 20 == 3, "15 ranges of 40.96 m"),
+        ("range", "0.35", lambda k: k % 5 == 3, "60 ranges of 0.35 m"),
+    ],
+)
+def test_a_placeholder_is_not_a_range(
+    tmp_path: Path, kind: str, value: str, rows: Callable[[int], bool], what: str
+) -> None:
+    run, said = read(tmp_path, with_value(kind, 3, value, rows))
+    assert what in said
+    assert "a placeholder" in said
+    assert float(value) not in run.readings.range_m
+    assert run.readings.range_m.size == len(W.read_s) - sum(rows(k) for k in range(len(W.read_s)))
+
+
+@pytest.mark.parametrize(
+    ("dbm", "what"),
+    [("-100", "60 signal strengths of -100 dBm"), ("100", "60 signal strengths of 100 dBm"), ("0", "of 0 dBm")],
+)
+def test_a_placeholder_is_not_a_signal_strength(tmp_path: Path, dbm: str, what: str) -> None:
+    def levels(k: int, cells: list[str]) -> list[str]:
+        level = dbm if k % 5 == 3 else f"{-40.0 - 20.0 * np.log10(float(cells[3])):.0f}"
+        return ["rssi", cells[1], cells[2], level]
+
+    run, said = read(tmp_path, each("range", levels))
+    assert what in said
+    assert run.readings.rssi_dbm.max() < 0.0
+    assert run.readings.rssi_dbm.min() > -80.0
+
+
+def test_an_empty_cell_is_a_beacon_that_was_not_heard(tmp_path: Path) -> None:
+    run, said = read(tmp_path, with_value("range", 3, "", lambda k: k == 10))
+    assert run.readings.range_m.size == len(W.read_s) - 1
+    assert "1 row not finite" in said
+
+
+def test_a_frozen_beacon_is_used_once(tmp_path: Path) -> None:
+    run, said = read(tmp_path, with_value("range", 3, "3.21", lambda k: k % 4 == 1 and 100 <= k < 200))
+    assert "range of beacon 7 repeats 3.21 25 times from" in said
+    assert np.sum(run.readings.range_m == 3.21) == 1
+
+
+def test_a_step_far_beyond_the_run_is_a_gap(tmp_path: Path) -> None:
+    run, said = read(tmp_path, with_value("odom", 2, "655.36", lambda k: k == 300))
+    assert "1 step of the odometry forward beyond what the run does otherwise" in said
+    assert "the first of 655 m at 30 s: taken as a gap" in said
+    assert run.steps.distance_m.sum() == pytest.approx(W.distance_m.sum(), abs=0.05)
+
+
+def test_single_positions_of_zero_or_elsewhere_are_no_truth(tmp_path: Path) -> None:
+    zero = each("truth", lambda k, cells: ["truth", cells[1], "0", "0", "0"] if k % 100 == 0 else cells)
+    run, said = read(tmp_path, zero)
+    assert "7 rows of truth at zero (the first here, at 0 s), not used" in said
+    run, said = read(tmp_path, with_value("truth", 2, "99", lambda k: k == 50))
+    assert "1 row of truth that jump there and back (the first here, at 5 s), not used" in said
+    assert run.truth is not None
+    assert run.truth.x_m.max() < 20.0
+
+
+def test_the_run_begins_and_ends_where_its_motion_is_known(tmp_path: Path) -> None:
+    lost = with_value("odom", 2, "nan", lambda k: 0 < k <= 20 or k > 580)
+    run, said = read(tmp_path, lost)
+    assert "the run begins here, at 2 s" in said
+    assert "the run ends here, at 58 s" in said
+    assert (run.steps.times_s[0], run.steps.times_s[-1]) == (2.0, 58.0)
+    assert run.first_pose == pytest.approx(W.poses[20])
+    assert np.all(np.asarray(run.steps.guess_m2) == 0.0)
+
+
+def test_a_short_start_before_a_pause_is_not_used(tmp_path: Path) -> None:
+    def paused(lines: list[str]) -> list[str]:
+        return [line for line in lines if not (line.startswith("odom") and 0.3 < float(line.split(",")[1]) < 5.0)]
+
+    run, said = read(tmp_path, paused)
+    assert "the run begins here, at 5 s" in said
+    assert run.first_pose == pytest.approx(W.poses[50])
+
+
+@pytest.mark.parametrize("turns_heading", [True, False])
+def test_a_heading_that_never_changes_is_none(tmp_path: Path, turns_heading: bool) -> None:
+    run, said = read(tmp_path, with_value("truth", 4, "0", lambda _: True), turns_heading=turns_heading)
+    assert "the truth has no heading: it is 0 rad throughout, while its course turns" in said
+    assert run.truth is not None
+    assert np.isnan(run.truth.heading_rad).all()
+    assert run.first_pose[2] == pytest.approx(W.poses[0, 2], abs=0.02)
+
+
+def test_the_course_of_a_vehicle_that_drives_sideways_is_no_error_of_its_heading(tmp_path: Path) -> None:
+    """The odometry says that the vehicle moves 0.43 rad to the left of its heading, and so says the truth."""
+
+    def sideways(_: int, cells: list[str]) -> list[str]:
+        way = float(cells[2])
+        return ["odom", cells[1], str(way * np.cos(0.43)), cells[3], str(way * np.sin(0.43))]
+
+    turned = each("truth", lambda _, cells: [*cells[:4], str(float(cells[4]) - 0.43)])
+    run, said = read(tmp_path, lambda lines: turned(each("odom", sideways)(lines)))
+    assert "truth heading is turned" not in said
+    assert run.first_pose[2] == pytest.approx(W.poses[0, 2] - 0.43)
+
+
+def test_a_turned_heading_can_be_kept(tmp_path: Path) -> None:
+    turned = each("truth", lambda _, cells: [*cells[:4], str(float(cells[4]) + 1.0)])
+    run, said = read(tmp_path, turned, turns_heading=False)
+    assert "truth heading is turned by -1.000 rad against the course; it is used as it is" in said
+    assert run.first_pose[2] == pytest.approx(W.poses[0, 2] + 1.0)
+    run, said = read(tmp_path, turned)
+    assert "it was turned back" in said
+    assert run.first_pose[2] == pytest.approx(W.poses[0, 2], abs=0.05)
