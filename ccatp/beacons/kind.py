@@ -44,6 +44,7 @@ BEACONS = MissionKind(
             f"{_STUDIES}.recordings:RECORDINGS",
             "estimators on recorded runs among beacons, from several starts",
         ),
+        "traits": (f"{_STUDIES}.traits:STUDY", "estimators on simulated runs with traits of real recordings"),
         "damage": (f"{_STUDIES}.damage:STUDY", "the filter on damaged recordings: recovered, reported or wrong"),
     },
     races=Part("ccatp.beacons.studies.bench_cases:races"),

@@ -1,0 +1,37 @@
+"""The study of traits: one small run of each kind of row, and how runs are combined."""
+
+import pytest
+
+from ccatp.beacons.config.load import load_recordings_config
+from ccatp.beacons.studies.traits import PLAIN, RECKONING, combine_traits, run_trait, trait_cells
+from ccatp.studies.campaign import Job, JobOutcome
+
+CFG = load_recordings_config()
+
+
+def test_an_estimator_is_better_than_dead_reckoning_and_consistent() -> None:
+    reckoned = run_trait(Job("traits", {"traits": PLAIN, "estimator": RECKONING}, 1, CFG)).values
+    found = run_trait(Job("traits", {"traits": PLAIN, "estimator": "ekf-slam"}, 1, CFG)).values
+    assert found["path_m"] < 0.5 * reckoned["path_m"]
+    assert "nees" not in reckoned
+    assert found["nees"] < 2.0
+    assert found["covered"] > 0.9
+
+
+def test_runs_are_combined_by_the_median_and_the_largest_nees_is_kept() -> None:
+    rows = [{"path_m": p, "beacons_m": None, "nees": n, "covered": 0.9, "run_s": 1.0} for p, n in ((1, 1), (2, 5))]
+    found = combine_traits({}, [*map(JobOutcome, rows), JobOutcome({"gave_up": True})]).values
+    assert (found["path_m"], found["nees"], found["nees_most"], found["gave_up"]) == (1.5, 3.0, 5, 1)
+    assert found["beacons_m"] is None
+    assert found["each_path_m"] == [1, 2, None]
+
+
+def test_each_trait_and_each_pair_is_a_cell() -> None:
+    names = {str(cell.factors["traits"]) for cell in trait_cells()}
+    assert len(names) == 1 + 9 + 36
+    assert {PLAIN, "correlated", "correlated+scale"} <= names
+
+
+def test_an_unknown_trait_is_refused() -> None:
+    with pytest.raises(ValueError, match="no trait 'slow'"):
+        run_trait(Job("traits", {"traits": "slow", "estimator": RECKONING}, 0, CFG))
