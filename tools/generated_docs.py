@@ -76,7 +76,7 @@ def table(head: str, rows: Iterable[Iterable[object]]) -> str:
 
 def alarms() -> str:
     """Every condition: what happens, and what to do."""
-    what = "| message | found by | reaction | permitted motion | ends | limit | meaning | what to do |"
+    what = "| message | found by | reaction | permitted motion | ends | limit | acts next | meaning | what to do |"
     parts = []
     for group in dict.fromkeys((*Group, *(row.group for row in all_conditions()))):
         rows = [_alarm(row) for row in all_conditions() if row.group == group]
@@ -99,6 +99,7 @@ def _alarm(row: Condition) -> tuple[str, ...]:
         row.motion.value,
         row.clear.value if row.clear is not None else ENDS[row.action],
         limit + retries,
+        f"{row.actor}{f'; people: {row.then}' if row.then else ''}",
         row.meaning,
         row.advice,
     )

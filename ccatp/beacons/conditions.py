@@ -29,14 +29,14 @@ hold = registered(
 # fmt: off
 RADIO_SILENT = hold("radio_silent", Owner.DANGER, 580, GROUP, "no beacon is received",
     "No reading of a beacon for `danger.radio_timeout_s`.", "Check the robot's radio and the beacons' supply.",
-    unit="s")
+    unit="s", then="check the robot's radio and the beacons' supply")
 NO_FRESH_ESTIMATE = hold("no_fresh_estimate", Owner.DANGER, 590, GROUP, "no fresh estimate",
     "Main has not reported where the robot is for `danger.estimate_timeout_s`.",
-    "Is something else busy on this machine?", unit="s")
+    "Is something else busy on this machine?", unit="s", then="end what else is busy on this machine")
 POSITION_UNCERTAIN = hold("position_uncertain", Owner.DANGER, 600, GROUP,
     "the position is too uncertain",
     "Its standard deviation is above `danger.position_sigma_m`. It ends below `danger.position_clear_m`.",
-    "Nothing, unless it lasts: beacons may fail.", unit="m")
+    "Nothing, unless it lasts: beacons may fail.", unit="m", then="check the beacons")
 OBSTACLE_AHEAD = near("obstacle_ahead", Owner.DANGER, 610, GROUP, "an obstacle ahead",
     "An echo is nearer than `danger.obstacle_m` on the course. Code 1.", "Nothing: the robot drives around it.")
 TARGET_NEAR = near("target_near", Owner.DANGER, 620, GROUP, "the target is too near",
@@ -47,8 +47,9 @@ OBSTACLE_BEHIND = near("obstacle_behind", Owner.DANGER, 630, GROUP, "an obstacle
 FRAMES_MISSED = fault("frames_missed", Owner.MISSION, ALONE, GROUP,
     "no frames while the robot moved: put it at its start and start a new mission",
     "The robot booted, or the link was away while it may have moved; the map of the beacons is not kept.",
-    "`ccatp stop`, put it at its start, start again.")
+    "`ccatp stop`, put it at its start, start again.", then="put the robot at its start, and start a new mission")
 MISSION_TOO_LONG = fault("mission_too_long", Owner.MISSION, ALONE, GROUP,
     "the mission takes longer than mission.time_limit_s = {limit_s:g}",
-    "The robot is held where it is.", "`ccatp abort` sends it home; or configure a longer time.")
+    "The robot is held where it is.", "`ccatp abort` sends it home; or configure a longer time.",
+    then="abort, or configure a longer time")
 # fmt: on

@@ -266,6 +266,6 @@ def _watch_terminal(answers: Iterator[dict[str, Any]]) -> None:
             table.add_column(style="bold")
             table.add_column(overflow="fold")
             for name, value in status_rows(answer.get("status", {})):
-                style = "red" if name in ("cause", "danger") and value not in ("", "0 normal") else ""
+                style = "red" if name in ("cause", "event code") and value not in ("", "0 normal") else ""
                 table.add_row(name, value.replace("[", "\\["), style=style)
             live.update(table, refresh=True)

@@ -96,6 +96,15 @@ class Owner(StrEnum):
     OPERATOR = "operator"
 
 
+class Actor(StrEnum):
+    """Who acts next while a condition holds the robot, sends it home or is reported."""
+
+    ROBOT = "robot"  # it continues by itself when the condition has ended
+    OPERATOR = "operator"
+    OBSERVATORY = "observatory"
+    NOBODY = "nobody"  # the mission is over, and nothing is left to do
+
+
 ALONE = 0  # precedence of a condition that its owner never reports together with another one
 
 
@@ -124,6 +133,8 @@ class Condition:
     ``escalates_to``. ``full_fans``: full fans meanwhile.
     ``retries``: how often it may repeat before it is a fault; ``None``: as configured.
     ``unit``: of the value against its limit. ``trusts_wheels``: what the wheels show in the hold is right.
+    ``actor``: who acts next. ``then``: the one next action of people, in the imperative; also where the robot acts
+    first, because the condition may last until it is a fault (``ccatp.survey.turn``).
     """
 
     name: str
@@ -142,6 +153,8 @@ class Condition:
     retries: int | None = None
     unit: str = ""
     trusts_wheels: bool = False
+    actor: Actor = Actor.ROBOT
+    then: str = ""
 
     @property
     def severity(self) -> Severity:
@@ -259,8 +272,10 @@ hold = registered(
 # More than ``health.retries`` of them within ``health.retry_window_s`` are a fault.
 diverged = registered(partial(Condition, action=Action.HOLD, motion=Motion.NONE, clear=Clear.AFTER_FIX))
 go_home = registered(partial(Condition, action=Action.RETURN, motion=Motion.RETURN))
-fault = registered(partial(Condition, action=Action.FAULT, motion=Motion.NONE, clear=Clear.OPERATOR))
-shaken = registered(partial(Condition, action=Action.EARTHQUAKE, motion=Motion.NONE))
+fault = registered(
+    partial(Condition, action=Action.FAULT, motion=Motion.NONE, clear=Clear.OPERATOR, actor=Actor.OPERATOR)
+)
+shaken = registered(partial(Condition, action=Action.EARTHQUAKE, motion=Motion.NONE, actor=Actor.OBSERVATORY))
 edge = registered(partial(Condition, action=Action.RETREAT, motion=Motion.RETREAT))
 near = registered(partial(Condition, action=Action.KEEP_AWAY, motion=Motion.RETREAT))
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from ccatp.core import Verdict
+from ccatp.core import NO_CAUSE, Cause, Verdict
 from ccatp.missions import SEARCHED, MissionKind, all_kinds
 
 
@@ -95,6 +95,21 @@ class Alarm(msgspec.Struct, kw_only=True):
     acknowledged_by: str = ""
 
 
+class Turn(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Whose turn it is, in names; ``ccatp.survey.turn`` makes it, and its words.
+
+    ``kind``: of the phase. ``actor``: who acts next. ``next``: the next action. ``bars``: why resume is refused.
+    ``offers``: the requests that the daemon would accept now.
+    """
+
+    kind: str = ""
+    actor: str = ""
+    next: str = ""
+    why: Cause = NO_CAUSE
+    bars: Cause = NO_CAUSE
+    offers: tuple[str, ...] = ()
+
+
 class MissionStatus(Message):
     """Mission state for operators."""
 
@@ -122,8 +137,8 @@ class MissionStatus(Message):
     friction: float = 0.0  # of the tyres, by the creep of turns; 0: not measured
     grip: float = 0.0  # full thrust over the least that holds the robot on all of the mirror with it
     alarms: list[Alarm] = []  # the highest severity first, ended ones last
-    command: str = ""  # the newest command of an operator that was accepted: pause, resume, abort or stop
-    commanded_by: str = ""  # its operator
+    turn: Turn = Turn()  # empty in older recordings
+    stopped_by: str = ""  # the operator who stopped the run
     summary_state: str = ""  # offline, standby, disabled, enabled or fault; empty in older recordings
 
 

@@ -89,7 +89,8 @@ def ending_of(status: MissionStatus | None, exit_status: ExitStatus, *, failure:
     if what is None:
         what = {ExitStatus.HELD: End.FAULTED, ExitStatus.INTERRUPTED: End.INTERRUPTED}.get(exit_status, End.FAILED)
     by = _by(what, status.condition)
-    who = status.commanded_by if by is By.OPERATOR else ""
+    caller = str(status.turn.why.values.get("by", ""))
+    who = (status.stopped_by if what is End.STOPPED else caller) if by is By.OPERATOR else ""
     return Ending(what, by, who, status.condition, "" if status.condition == OPERATOR.name else status.cause, alarms)
 
 
@@ -121,10 +122,14 @@ def why_text(ending: Ending) -> str:
     return ", ".join(part for part in (by, cause) if part)
 
 
+def end_text(ending: Ending) -> str:
+    """What happened, by whom and why."""
+    return "; ".join(part for part in (_TEXTS[ending.what], why_text(ending)) if part)
+
+
 def ending_text(ending: Ending) -> str:
-    """The end in one line."""
-    parts = _TEXTS[ending.what], why_text(ending), alarms_text(ending.alarms)
-    return "; ".join(part for part in parts if part)
+    """The end in one line, with the alarms."""
+    return "; ".join(part for part in (end_text(ending), alarms_text(ending.alarms)) if part)
 
 
 def alarms_text(alarms: Iterable[AlarmAtEnd]) -> str:

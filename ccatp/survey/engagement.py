@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from ccatp.conditions import Action, Clear, Motion, Owner, find_condition, text_of
 from ccatp.conditions.danger import EARTHQUAKE
-from ccatp.conditions.mission import NO_VERDICT
+from ccatp.conditions.mission import NO_VERDICT, OPERATOR
 from ccatp.core import NO_CAUSE, NO_MOTION, Cause, EventCode, Permits, Severity, Verdict
 from ccatp.survey.events import (
     DONE,
@@ -446,7 +446,9 @@ def _resume_refusal(s: Engagement) -> str | None:
     if is_latched and not s.abort_cause:
         return "an emergency of before is latched: 'ccatp clear' it first"
     if severity >= HOLD and severity is not RETURN:
-        return f"the cause persists: {text_of(s.cause)}"
+        is_paused = s.cause.condition == OPERATOR.name  # danger's own finding is not in the state
+        what = f"danger has found a {severity.name.lower()}; see 'ccatp alarms'" if is_paused else text_of(s.cause)
+        return f"the cause persists: {what}"
     return None
 
 
@@ -498,6 +500,11 @@ class EngagedMission(Generic[S]):
         """Apply an event between two frames; returns why it was refused, or ``None``."""
         self._state, refusal = self._rules.handle(self._state, event)
         return refusal
+
+    def after(self, event: SurveyInput) -> S | None:
+        """The state after an event if it were applied now, ``None`` if it would be refused; nothing changes."""
+        state, refusal = self._rules.handle(self._state, event)
+        return state if refusal is None else None
 
     def react(self, frame: Any, verdict: Verdict | None) -> S:
         """React to the verdict in force in a frame; the state after it."""

@@ -11,7 +11,7 @@ import zmq.asyncio
 
 from ccatp.clocks import MissionClock
 from ccatp.conditions import text_of
-from ccatp.conditions.mission import LINK_LOST, NO_FRAME_FOR, OPERATOR
+from ccatp.conditions.mission import LINK_LOST, NO_FRAME_FOR
 from ccatp.daemon.loops.alarm_watch import AlarmWatch
 from ccatp.daemon.loops.frame_time import DriveSender, FrameTime, LockstepTime, RealTime
 from ccatp.daemon.loops.mission_runner import STILL, LoopLimits, MissionHost, MissionRunner, TimedFrame
@@ -27,7 +27,8 @@ from ccatp.links.channels import OperatorCommand, OperatorRequest
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import ESTIMATE_FRAMES, MissionStatus
 from ccatp.missions import kind_of
-from ccatp.survey.events import Abort, Interrupted, Pause, Resume, StopHere
+from ccatp.survey.events import Interrupted
+from ccatp.survey.turn import REQUESTS, offers_of, turn_of
 
 # The supervisor ends this process after it has received the last messages; a longer wait is reported.
 SHUTDOWN_REPORT_S = 30.0
@@ -35,13 +36,6 @@ SHUTDOWN_REPORT_S = 30.0
 SAMPLED_LEVELS = 10
 # Without samples for longer than this, the place of a moving robot is not known.
 UNSEEN_S = 0.1
-
-COMMANDS: dict[OperatorCommand, Pause | Resume | Abort | StopHere] = {
-    OperatorCommand.PAUSE: Pause(OPERATOR.cause()),
-    OperatorCommand.RESUME: Resume(),
-    OperatorCommand.ABORT: Abort(OPERATOR.cause()),
-    OperatorCommand.STOP: StopHere(),
-}
 
 
 class UnhandledError(CcatpError):
@@ -81,7 +75,7 @@ class MainLoop:
         self._is_new_session = False
         self._was_at_rest = False
         self._levels_sent = 0
-        self._command = self._commanded_by = ""  # the newest command that was accepted
+        self._stopped_by = ""
         self._alarms = AlarmWatch(context, danger, AlarmList(args.run_dir, self.log))
         self._runner = runner = make_runner(self)
         self._telemetry = runner.telemetry
@@ -247,8 +241,10 @@ class MainLoop:
         status.bad_lines = link.counts["bad_lines"]
         status.bad_line = link.first_bad_line
         status.alarms = self._alarms.alarms.alarms
-        status.command, status.commanded_by = self._command, self._commanded_by
-        status.summary_state = str(self._runner.mission.state.summary_state)
+        status.stopped_by = self._stopped_by
+        mission = self._runner.mission
+        status.turn = turn_of(mission.state, verdict, offers_of(mission), self._runner.wait_cause)
+        status.summary_state = str(mission.state.summary_state)
         return status
 
     # -- what the mission and the operators need of this loop --------------------------------------------------------
@@ -270,11 +266,11 @@ class MainLoop:
             self._update_alarms()
             refusal = self._alarms.alarms.acknowledge(request.name, by, self.clock.t_s)
         else:
-            refusal = self._runner.mission.handle(COMMANDS[request.cmd])
+            refusal = self._runner.mission.handle(REQUESTS[request.cmd](by))
         if refusal is None:
             self._telemetry.notify_operator("info", f"{by}: {f'{request.cmd} {request.name}'.strip()}")
-            if request.cmd in COMMANDS:
-                self._command, self._commanded_by = str(request.cmd), by
+            if request.cmd in REQUESTS:
+                self._stopped_by = by if request.cmd is OperatorCommand.STOP else ""
                 self.release_time()
         return refusal
 

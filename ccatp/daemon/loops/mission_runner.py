@@ -15,7 +15,7 @@ import msgspec
 import structlog
 
 from ccatp.clocks import MissionClock
-from ccatp.core import Cause, Verdict
+from ccatp.core import NO_CAUSE, Cause, Verdict
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Publisher, Telemetry
 from ccatp.links.robot_messages import Hello, Sensors
@@ -117,6 +117,11 @@ class MissionRunner(ABC):
         """The causes why the mission is held, goes home, or waits."""
         state = self.mission.state
         return [cause for cause in (state.cause, state.abort_cause) if cause]
+
+    @property
+    def wait_cause(self) -> Cause:
+        """Why a robot that works stands and waits, beside the causes in its state."""
+        return NO_CAUSE
 
     @property
     @abstractmethod

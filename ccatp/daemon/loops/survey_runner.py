@@ -92,6 +92,10 @@ class SurveyRunner(MissionRunner):
         return [*super().causes, *(cause for cause in own if cause)]
 
     @property
+    def wait_cause(self) -> Cause:
+        return self._fix_service.wait_cause
+
+    @property
     def is_at_rest(self) -> bool:
         control = self._cfg.control
         return (

@@ -21,10 +21,11 @@ from ccatp.daemon.supervision.run_text import RunText, clock
 from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
-from ccatp.missions import SEARCHED, kind_of
+from ccatp.missions import kind_of
 from ccatp.records.summary import format_table
 from ccatp.survey.ending import ending_text, read_ending
-from ccatp.survey.events import DONE, HELD, IDLE, MEASURING, SETTLING, WAITS_FOR, waits_for
+from ccatp.survey.engagement import MOVING
+from ccatp.survey.turn import turn_text
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
 # Signals that end a run, or the writing of its report.
@@ -187,7 +188,6 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
             signal.signal(number, handler)
 
 
-_STANDING = (IDLE, SETTLING, MEASURING, HELD, DONE)
 CODES = {0: "normal", 1: "near the mirror's edge", 2: "operation aborted"}
 BAR = 30
 _SHOWN = 10
@@ -216,21 +216,22 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
     late = f"{status.missed_deadlines}, worst {status.worst_lateness_ms:.0f} ms"
     grip = f"friction {status.friction:.2f}, thrust {status.grip:.2f} times the least that holds the robot"
     bad = f"{status.bad_lines} from the robot, the first: {status.bad_line}; 'ccatp conformance' checks the firmware"
+    remaining = f", {clock(status.eta_s)} remaining, {bound}" if is_under_way(status) else ""
     rows = [
+        ("now", turn_text(status).line),
         ("state", f"{status.state} {status.point}".strip()),
         ("summary state", status.summary_state),
         ("cause", status.cause),
         ("severity", severity.name.lower() if severity else ""),
-        ("next", next_text(status)),
         ("for", clock(status.t_s - status.since_s) if status.cause else ""),
         ("alarms", alarms_text(status.alarms)),
         ("what to do", row.advice if row is not None else ""),
         ("outcome", status.outcome),
         ("points", f"{status.done} of {status.total} measured{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"),
-        ("time", f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} remaining, {bound}"),
+        ("time", f"{clock(status.elapsed_s)} elapsed{remaining}"),
         ("arrival", arrival),
         ("grip", grip if status.grip else ""),
-        ("danger", f"{status.code} {CODES.get(status.code, '')}".strip()),
+        ("event code", f"{status.code} {CODES.get(status.code, '')}".strip()),
         ("late frames", late if status.missed_deadlines else ""),
         ("bad lines", bad if status.bad_lines else ""),
         *((f"not measured: {why}", _named(points)) for why, points in status.left_out.items()),
@@ -239,14 +240,9 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(name, value) for name, value in rows if value]
 
 
-def next_text(status: MissionStatus) -> str:
-    """What a robot waits for that stands while nothing is wrong; empty if it moves, or its cause says why it stands."""
-    if status.cause or status.alarms or status.exit_status >= 0:
-        return ""
-    stands = status.state in _STANDING
-    if status.state not in WAITS_FOR:
-        stands = any(status.state in kind.stands for kinds in SEARCHED for kind in kinds())
-    return waits_for(status.state) if stands else ""
+def is_under_way(status: MissionStatus) -> bool:
+    """Whether the mission makes progress, so that its remaining time means something."""
+    return not status.outcome and status.exit_status < 0 and (not status.turn.kind or status.turn.kind in MOVING)
 
 
 def alarms_text(alarms: Sequence[Alarm]) -> str:
@@ -263,7 +259,6 @@ def _named(points: Sequence[str]) -> str:
 def status_line(answered: Mapping[str, Any]) -> str:
     """The status in one line."""
     status = _read(answered)
-    what = f"{status.state} {status.point}".strip()
-    cause = f" ({status.cause})" if status.cause else ""
-    times = f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} remaining"
-    return f"{100.0 * share_done(status):.0f} %: {status.done} of {status.total} points, {what}{cause}, {times}"
+    remaining = f", {clock(status.eta_s)} remaining" if is_under_way(status) else ""
+    times, what = f"{clock(status.elapsed_s)} elapsed{remaining}", turn_text(status).line
+    return f"{100.0 * share_done(status):.0f} %: {status.done} of {status.total} points, {times}: {what}"

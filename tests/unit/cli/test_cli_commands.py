@@ -158,11 +158,12 @@ STATUS = {
 
 def test_the_table() -> None:
     assert status_rows(STATUS) == [
+        ("now", "driving"),  # the daemon is of an older version
         ("state", "driving 3-4-5"),
         ("points", f"120 of 693 measured, 3 skipped  [{'#' * 5}{'.' * 25}]"),
         ("time", "12:34 elapsed, 1:01:40 remaining, minimum 50:00"),
         ("arrival", "0.05 mm from the last point, as estimated"),
-        ("danger", "0 normal"),
+        ("event code", "0 normal"),
     ]
     assert dict(status_rows({**STATUS, "error_mm": 0.0}))["arrival"] == "none yet"
     held = {
@@ -175,7 +176,7 @@ def test_the_table() -> None:
         dict(status_rows(held)).items()
         >= {
             "cause": "operator",
-            "danger": "2 operation aborted",
+            "event code": "2 operation aborted",
             "late frames": "4, worst 31 ms",
             "not measured: out of time": "1-2-3, 1-2-4",
             "not measured: operator": f"93 points: {first}, ...",
@@ -198,8 +199,15 @@ def test_what_holds_the_robot_is_shown_with_severity_duration_and_advice() -> No
 
 
 def test_one_line() -> None:
-    assert status_line(STATUS) == "18 %: 120 of 693 points, driving 3-4-5, 12:34 elapsed, 1:01:40 remaining"
-    assert "held (operator)" in status_line({**STATUS, "state": "held", "point": "", "cause": "operator"})
+    drives = {"kind": "work", "actor": "robot", "next": "go_on"}
+    assert status_line({**STATUS, "turn": drives}) == (
+        "18 %: 120 of 693 points, 12:34 elapsed, 1:01:40 remaining: driving to 3-4-5. "
+        "Next: the robot continues by itself"
+    )
+    paused = {"kind": "paused", "actor": "operator", "next": "resume", "offers": ["resume"]}
+    held = {**STATUS, "state": "held", "turn": {**paused, "why": {"condition": "operator", "values": {"by": "eva"}}}}
+    assert status_line(held).endswith(" 12:34 elapsed: paused by eva. Next: an operator: resume")
+    assert "remaining" not in dict(status_rows(held))["time"]
     assert status_line({}).startswith("0 %: 0 of 0 points")
     assert [clock(s) for s in (-1.0, 0.4, 59.6, 3600.0)] == ["0:00", "0:00", "1:00", "1:00:00"]
 
@@ -217,7 +225,7 @@ def test_watching_tells_changes_until_the_end(runtime_dir: Path, capsys: pytest.
     assert len(asked) == 4
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 3  # what did not change is not told again
-    assert lines[-1].startswith("100 %: 693 of 693 points, done")
+    assert lines[-1].endswith("100 %: 693 of 693 points, 12:34 elapsed: done")
     with serving(runtime_dir, "control", answers({}, {"exit_status": 3})):
         assert main([*command, "--json"]) == 0
     assert [json.loads(line)["status"]["exit_status"] for line in capsys.readouterr().out.splitlines()] == [-1, 3]

@@ -14,15 +14,16 @@ import zmq
 
 from ccatp.beacons.modes import BeaconMode
 from ccatp.config.load import load_config
+from ccatp.core import NO_CAUSE
 from ccatp.daemon.loops.main_loop import MainLoop
 from ccatp.daemon.loops.mission_runner import MissionRunner
 from ccatp.daemon.loops.standstill import STANDS_REPORT_S
-from ccatp.daemon.operator.terminal import next_text, status_rows
+from ccatp.daemon.operator.terminal import status_rows
 from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import MissionStatus
 from ccatp.survey.engagement import Engagement, Kind, Phase
-from ccatp.survey.events import WAITS_FOR, Mode, waits_for
+from ccatp.survey.events import Mode, waits_for
 
 
 @contextmanager
@@ -80,8 +81,9 @@ def standing(mode: Mode | BeaconMode, said: list[str]) -> SimpleNamespace:
     )
     return SimpleNamespace(
         telemetry=telemetry,
-        mission=SimpleNamespace(state=Engagement(Standing(mode))),
+        mission=SimpleNamespace(state=Engagement(Standing(mode)), after=lambda _: None),
         causes=(),
+        wait_cause=NO_CAUSE,
         is_at_rest=True,
         is_busy=False,
         since_s=0.0,
@@ -107,10 +109,6 @@ def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
     assert waits_for(mode)
 
 
-def test_the_status_of_a_robot_that_stands_says_what_is_next() -> None:
-    assert next_text(MissionStatus(seq=0, t_s=0.0, state="idle")) == WAITS_FOR[Mode.IDLE]
-    for told in ({"cause": "operator"}, {"exit_status": 0}):
-        assert next_text(MissionStatus(seq=0, t_s=0.0, state="idle", **told)) == ""
-    for moving in (Mode.DRIVING, BeaconMode.FOLLOWING):
-        assert next_text(MissionStatus(seq=0, t_s=0.0, state=str(moving))) == ""
-    assert next_text(MissionStatus(seq=-1, t_s=0.0, state="")) == ""
+def test_the_first_row_of_the_status_says_whose_turn_it_is(loop: MainLoop) -> None:
+    shown = status_rows(msgspec.to_builtins(loop.status()))
+    assert shown[0] == ("now", "idle. Next: the robot continues by itself")

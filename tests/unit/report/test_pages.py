@@ -149,7 +149,7 @@ def test_a_run_given_up_before_its_first_point_says_why(recorded: Path) -> None:
             ("ended with status 4, held", "stuck", False),
         ),
         (
-            {"outcome": "stopped", "exit_status": 4, "cause": "encoder samples stale", "commanded_by": "eva"},
+            {"outcome": "stopped", "exit_status": 4, "cause": "encoder samples stale", "stopped_by": "eva"},
             ("stopped", "by eva, held before: encoder samples stale", False),
         ),
         ({"outcome": "", "exit_status": -1, "state": "driving", "cause": ""}, ("interrupted", "while driving", False)),

@@ -8,17 +8,19 @@ from ccatp.conditions.danger import EMERGENCY, ENCODERS_STALE
 from ccatp.conditions.mission import OPERATOR
 from ccatp.core import Cause
 from ccatp.errors import ExitStatus
-from ccatp.links.topics import Alarm, MissionStatus
+from ccatp.links.topics import Alarm, MissionStatus, Turn
 from ccatp.survey.ending import By, End, ending_of, ending_text, read_ending
 from ccatp.survey.events import SurveyOutcome
 
-STALE, FIRE, CALLED = ENCODERS_STALE.cause(), EMERGENCY.cause(kind="fire"), OPERATOR.cause()
+STALE, FIRE = ENCODERS_STALE.cause(), EMERGENCY.cause(kind="fire")
+CALLED, UNNAMED = OPERATOR.cause(by="eva"), OPERATOR.cause()
 
 
 def status(cause: Cause, outcome: SurveyOutcome = SurveyOutcome.NONE, by: str = "") -> MissionStatus:
     return MissionStatus(
-        seq=1, t_s=2.0, state="done", cause=text_of(cause), condition=cause.condition, outcome=outcome, commanded_by=by
-    )
+        seq=1, t_s=2.0, state="done", cause=text_of(cause), condition=cause.condition, outcome=outcome,
+        stopped_by=by if outcome is SurveyOutcome.STOPPED else "", turn=Turn(why=cause),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -47,8 +49,8 @@ def test_the_end_names_what_happened_and_who_did_it(
 
 
 def test_an_operator_without_a_name_is_still_the_operator() -> None:
-    ending = ending_of(status(CALLED, SurveyOutcome.STOPPED), ExitStatus.HELD)
-    assert ending_text(ending) == "stopped where it was; by an operator"
+    ending = ending_of(status(UNNAMED, SurveyOutcome.AT_BASE), ExitStatus.ABORTED)
+    assert ending_text(ending) == "returned to base; by an operator"
 
 
 def test_the_death_of_a_process_ends_a_run_before_its_status_says_so() -> None:
