@@ -187,6 +187,11 @@ def turn_text(status: MissionStatus) -> TurnText:
     return TurnText(_does(status, turn), _WHO[Actor(turn.actor)], _then(turn), request)
 
 
+def is_under_way(status: MissionStatus) -> bool:
+    """Whether the mission makes progress, so that its remaining time means something."""
+    return not status.outcome and status.exit_status < 0 and (not status.turn.kind or status.turn.kind in MOVING)
+
+
 def _does(status: MissionStatus, turn: Turn) -> str:
     if turn.kind == Kind.OVER:
         return end_text(ending_of(status, ExitStatus(max(status.exit_status, ExitStatus.COMPLETE))))

@@ -12,8 +12,12 @@ import msgspec
 import pytest
 from playwright.async_api import Page, async_playwright, expect
 
+from ccatp.conditions import text_of
+from ccatp.conditions.danger import EMERGENCY, ENCODERS_STALE, WHEEL_BLOCKED
+from ccatp.conditions.mission import FRAME_LATE, NO_WAY_ON, OPERATOR
 from ccatp.config.load import load_config
-from ccatp.links.topics import Alarm, FixMessage, TrackMessage
+from ccatp.core import Cause
+from ccatp.links.topics import Alarm, FixMessage, TrackMessage, Turn
 from ccatp.report.dashboard.history import Growing
 from tests.contract.page_rig import Rig, page_rig
 
@@ -105,7 +109,17 @@ async def operator(runtime_dir: Path) -> AsyncIterator[Operator]:
         yield operator
 
 
+async def test_the_map_shows_the_planned_points_then_the_whole_mirror(operator: Operator) -> None:
+    across = "Math.max(...window.drawn.circles.map(([x]) => x)) - Math.min(...window.drawn.circles.map(([x]) => x))"
+    width = await operator.page.evaluate("document.querySelector('#map').clientWidth")
+    await operator.until(f"{across} > {0.5 * width}", True)  # two panels of 77
+    await operator.page.locator("#fit").click()
+    await operator.until(f"{across} < {0.4 * width}", True)
+    await operator.until_text("#fit", "Points")
+
+
 async def test_panels_have_their_numbers_where_there_is_room_and_over_no_point(operator: Operator) -> None:
+    await operator.page.locator("#fit").click()
     await operator.until("window.drawn.texts.some(([text]) => text === '5-5')", True)
     drawn = await operator.page.evaluate("window.drawn")
     assert len(drawn["texts"]) == 77
@@ -130,19 +144,68 @@ def alarm(name: str, severity: Any, **fields: Any) -> Alarm:
     return Alarm(name=name, severity=severity, **{**known, **fields})
 
 
+def held(kind: str, actor: str, then: str, why: Cause, *offers: str) -> dict[str, Any]:
+    turn = Turn(kind=kind, actor=actor, next=then, why=why, offers=offers)
+    return {"state": "held", "cause": text_of(why), "condition": why.condition, "turn": turn}
+
+
+async def test_the_line_says_whose_turn_it_is_and_has_the_one_button_that_is_accepted(operator: Operator) -> None:
+    called = OPERATOR.cause(by="eva")
+    operator.status = held("paused", "operator", "resume", called, "resume", "abort", "stop")
+    await operator.until_text("#state", "paused by eva")
+    await operator.until_text("#next", "Next: an operator: resume")
+    await operator.until("document.querySelector('#act').hidden", False)
+    await operator.until("document.querySelector('#pause').disabled", True)
+    await operator.until("document.querySelector('#eta').textContent", "\u2013")
+    await operator.page.locator("#act").click()
+    await operator.until_text("#answer", "resume: done")
+    assert [one["cmd"] for one in operator.rig.asked] == ["resume"]
+    operator.status = held("faulted", "operator", "hands", WHEEL_BLOCKED.cause(side="left"), "abort", "stop")
+    await operator.until("document.querySelector('#act').hidden", True)
+    await operator.until("document.querySelector('#resume').disabled", True)
+    await operator.until("/^status \\d\\.\\d s old$/.test(document.querySelector('#age').textContent)", True)
+    operator.rig.stop.set()  # the dashboard ends; the survey may go on
+    await operator.page.wait_for_function("document.querySelector('#age').textContent.startsWith('no daemon answers')")
+
+
+async def test_after_the_end_alarms_stay_and_nothing_is_offered(operator: Operator) -> None:
+    why = ENCODERS_STALE.cause()
+    operator.status = {
+        **held("over", "operator", "hands", why), "state": "done", "outcome": "stopped", "stopped_by": "eva",
+        "exit_status": 4, "alarms": [alarm("encoders_stale", "hold")],
+    }  # fmt: skip
+    latched = {"active": [{"kind": "fire", "id": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11", "note": "smoke"}]}
+    (operator.folder / "emergencies.json").write_bytes(msgspec.json.encode(latched))
+    await operator.until_text("#state", "stopped where it was; by eva, held before: encoder samples stale")
+    await operator.until_text("#alarms-head", "Alarms active at the end")
+    await operator.until("document.querySelectorAll('#alarms li').length", 1)
+    await operator.until("document.querySelectorAll('#alarms button, #emergencies button').length", 0)
+    await operator.until("[...document.querySelectorAll('.controls button')].every(one => one.disabled)", True)
+    await operator.until("document.querySelector('#permit-forward').dataset.on ?? ''", "")
+    operator.rig.stop.set()
+    await operator.page.wait_for_selector("#ended:not([hidden])")
+    assert await operator.page.locator("#utc-name").text_content() == "last seen, UTC"
+
+
+async def test_terms_are_explained_on_a_tap(operator: Operator) -> None:
+    await operator.until("document.querySelectorAll('#gauges [data-term]').length >= 5", True)
+    await operator.page.locator("#gauges [data-term=dop]").click()
+    await operator.until("document.querySelector('#explain').textContent.startsWith('DOP, dilution of')", True)
+
+
 async def test_a_pause_is_no_alarm_and_a_fault_is_one_in_colour_and_in_words(operator: Operator) -> None:
     state = "document.querySelector('#state').dataset.level"
-    operator.status = {"state": "held", "cause": "operator", "condition": "operator"}
+    operator.status = held("paused", "operator", "resume", OPERATOR.cause(by="eva"), "resume")
     await operator.until(state, "note")
-    await operator.until_text("#state", "held by an operator")
     await operator.until_text("#held", "held, the mission is held")
-    operator.status = {"state": "held", "cause": "a frame was served 60 ms late (limit 50 ms)"}
+    operator.status = held("held", "robot", "wait", FRAME_LATE.cause(late_ms=60.0, limit_ms=50.0))
     await operator.until(state, "warn")
     alarms = [alarm(str(k), severity) for k, severity in enumerate(("fault", "slow", "inform"))]
     ended = alarm(
         "old", "hold", ended="2026-11-26T03:10:00Z", acknowledged_by="anna", acknowledged="2026-11-26T03:11:00Z"
     )
-    operator.status = {"state": "held", "cause": "no way on: rim", "alarms": [*alarms, ended]}
+    faulted = held("faulted", "operator", "resume", NO_WAY_ON.cause(why="rim"), "resume")
+    operator.status = {**faulted, "alarms": [*alarms, ended]}
     await operator.until(state, "bad")
     rows = rows_of("#alarms li", "row.querySelector('b').textContent")
     await operator.until(rows, [["bad", "■ fault"], ["warn", "▲ slow"], ["note", "● inform"], ["", "\u2013 hold"]])
@@ -175,7 +238,7 @@ async def test_times_names_and_values_with_their_limits(operator: Operator) -> N
         ["bad", "battery low 30 % ≥ 31 %"], ["", "fan left 80 %"], ["", "fan right 50 %"],
         ["bad", "laser DOP high 25.0 ≤ 20.0"], ["", "laser residual 2.0 µm ≤ 5000 µm"],
     ])  # fmt: skip
-    await operator.until(rows + ".slice(6)", [["", "permit, age 8 ms ≤ 150 ms"], ["", "drive, age 12 ms ≤ 200 ms"]])
+    await operator.until(rows + ".slice(7)", [["", "permit, age 8 ms ≤ 150 ms"], ["", "drive, age 12 ms ≤ 200 ms"]])
 
 
 def track(t_s: float, x_m: float) -> TrackMessage:
@@ -187,6 +250,8 @@ async def test_plots_are_zoomed_by_dragging_and_keep_their_history_when_the_page
 ) -> None:
     operator.status = {"t_s": 0.0, "elapsed_s": 0.0}
     operator.live()
+    await operator.until("document.querySelector('#plot-jump').closest('figure').hidden", True)
+    await operator.page.locator("#engineer").check()
     for k in range(100):
         operator.rig.main.send("fix", FixMessage(
             seq=k, t_s=float(k), point=None, is_fused=True, position_m=(0.0, 0.0, 0.0), covariance_m2=[0.0] * 9,
@@ -219,6 +284,7 @@ async def test_plots_are_zoomed_by_dragging_and_keep_their_history_when_the_page
 
 async def test_no_path_is_drawn_over_a_time_of_which_nothing_is_known(operator: Operator) -> None:
     begun = "window.drawn.texts.length === 77 ? window.drawn.begun : 0"
+    await operator.page.locator("#fit").click()
     await operator.until("document.querySelector('#pose-xy').textContent.endsWith(' m')", True)
     await operator.until("window.drawn.texts.length", 77)
     without = await operator.page.evaluate(begun)
@@ -226,6 +292,7 @@ async def test_no_path_is_drawn_over_a_time_of_which_nothing_is_known(operator: 
         operator.rig.main.send("track", track(t_s, 0.05 * min(t_s, 4.0) - 0.1 + 0.001 * t_s))
     await operator.until(begun, without + 2)
     await operator.page.reload()
+    await operator.page.locator("#fit").click()
     await operator.until(begun, without + 2)
 
 
@@ -289,6 +356,10 @@ async def test_an_emergency_is_reported_and_cleared_after_a_confirmation(operato
     latched = {"active": [{"kind": "fire", "id": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11", "note": "smoke"}]}
     (operator.folder / "emergencies.json").write_bytes(msgspec.json.encode(latched))
     await operator.until("document.querySelector('#emergencies strong')?.textContent", "fire: smoke")
+    await expect(page.locator("#emergencies button")).to_have_count(0)  # the robot drives home
+    operator.status = held("held", "observatory", "clear", EMERGENCY.cause(kind="fire"), "clear", "stop")
+    await page.wait_for_timeout(200)
+    await operator.until("document.querySelectorAll('#emergencies button').length", 1)
     await page.locator("#emergencies button").click()
     await page.locator("#clear button[value='']").click()
     await page.locator("#emergencies button").click()

@@ -24,8 +24,7 @@ from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionS
 from ccatp.missions import kind_of
 from ccatp.records.summary import format_table
 from ccatp.survey.ending import ending_text, read_ending
-from ccatp.survey.engagement import MOVING
-from ccatp.survey.turn import turn_text
+from ccatp.survey.turn import is_under_way, turn_text
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
 # Signals that end a run, or the writing of its report.
@@ -238,11 +237,6 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("exit status", str(status.exit_status) if status.exit_status >= 0 else ""),
     ]
     return [(name, value) for name, value in rows if value]
-
-
-def is_under_way(status: MissionStatus) -> bool:
-    """Whether the mission makes progress, so that its remaining time means something."""
-    return not status.outcome and status.exit_status < 0 and (not status.turn.kind or status.turn.kind in MOVING)
 
 
 def alarms_text(alarms: Sequence[Alarm]) -> str:

@@ -83,6 +83,7 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool) -> dict[str, Any]:
             "permit_age_s": cfg.mission.verdict_timeout_s,
             "dop": cfg.etalon.max_dop,
             "residual_um": 1e6 * cfg.etalon.max_residual_m,
+            "grip": cfg.robot.thrust_margin,
         },
         "hides": [],
         "words": WORDS,

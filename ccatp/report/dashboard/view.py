@@ -18,6 +18,7 @@ from ccatp.links.liveness import Liveness
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import BY_NAME, Heartbeat, MissionStatus, TruthBatch
 from ccatp.report.dashboard.history import GAP_S, Growing, Lines, RunFiles, Trail, TruthCompare
+from ccatp.survey.turn import is_under_way, turn_text
 
 LOOPS = ("main", "danger")
 NAMES = {"main": "main loop", "danger": "danger loop"}
@@ -289,7 +290,7 @@ class RunStateView:
 
     def _finish_in_s(self, status: MissionStatus, now_s: float) -> float | None:
         """Real time until the expected end (s); in lockstep mission time does not run at the rate of real time."""
-        if status.outcome or self._began is None or status.eta_s <= 0.0:
+        if not is_under_way(status) or self._began is None or status.eta_s <= 0.0:
             return None
         began_s, elapsed_s = self._began
         if (watched_s := now_s - began_s) < PACE_AFTER_S or status.elapsed_s <= elapsed_s:
@@ -309,6 +310,8 @@ class RunStateView:
                 "next_point": self._next_point(status),
                 "not_to_be_measured": sum(map(len, status.left_out.values())),
                 "finish_in_s": self._finish_in_s(status, now_s),
+                "age_s": round(max(now_s - self._status_s, 0.0), 2),
+                "turn_text": {**turn_text(status)._asdict(), "line": turn_text(status).line},
                 "is_by_operator": status.condition == OPERATOR.name,
             }
         verdict: dict[str, Any] | None = None
@@ -336,7 +339,7 @@ class RunStateView:
             "started": self._files.started,
             "emergencies": self._files.emergencies,
             "messages_left_out": self._lines.left_out,
-            "alarms": [] if mission is None or self.links.is_over else mission.pop("alarms"),
+            "alarms": [] if mission is None else mission.pop("alarms"),
         }
 
     def _robot(self) -> dict[str, Any] | None:

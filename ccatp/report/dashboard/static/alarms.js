@@ -22,6 +22,7 @@ export class Alarms {
     this.known = new Set();
     this.tones = null;
     this.chosen = null;
+    this.emergencies = [];
     // If the operator turned it on: a tone and a browser notification for each new severe alarm.
     $("sound").onchange = () => {
       this.tones = $("sound").checked ? new AudioContext() : null;
@@ -69,21 +70,33 @@ export class Alarms {
     $("clear").showModal();
   }
 
-  receive({ alarms, emergencies }, isAll) {
+  // The first emergency that is latched, from the button of the next action.
+  clearFirst() {
+    if (this.emergencies.length) this.askToClear(this.emergencies[0]);
+  }
+
+  receive({ alarms, emergencies, is_over, mission }, isAll) {
+    this.emergencies = emergencies;
+    const canClear = !is_over && (mission?.turn.offers ?? []).includes("clear");
+    const title = is_over ? "Alarms active at the end" : "Alarms";
+    if ($("alarms-head").textContent !== title) $("alarms-head").textContent = title;
     this.announce(alarms, isAll);
     $("alarms-card").hidden = alarms.length + emergencies.length === 0;
-    fill($("emergencies"), emergencies, (emergency) => {
+    fill($("emergencies"), emergencies.map((emergency) => ({ ...emergency, canClear })), (emergency) => {
       const row = node("li", "");
       row.dataset.level = "bad";
       const head = node("span", "");
       head.append(node("b", "■ emergency"), node("strong", `${emergency.kind}${emergency.note ? `: ${emergency.note}` : ""}`));
-      const button = node("button", "Clear …");
-      button.onclick = () => this.askToClear(emergency);
       row.title = emergency.id;
-      row.append(head, button);
+      row.append(head);
+      if (canClear) {
+        const button = node("button", "Clear …");
+        button.onclick = () => this.askToClear(emergency);
+        row.append(button);
+      }
       return row;
     });
-    fill($("alarms"), alarms, (alarm) => this.row(alarm));
+    fill($("alarms"), alarms.map((alarm) => ({ ...alarm, isOver: is_over })), (alarm) => this.row(alarm));
   }
 
   row(alarm) {
@@ -97,7 +110,7 @@ export class Alarms {
     const ended = alarm.ended ? `, ended ${time(alarm.ended)}` : "";
     head.append(node("small", ` since ${time(alarm.since)}${times}${ended}${by}`));
     row.append(head, node("p", alarm.advice));
-    if (!alarm.acknowledged_by) {
+    if (!alarm.acknowledged_by && !alarm.isOver) {
       const button = node("button", "Acknowledge", "acknowledge");
       button.onclick = () => this.commands.acknowledge(alarm.name);
       row.append(button);

@@ -12,6 +12,7 @@ export class Commands {
     this.timer = null;
     this.waiting = null;
     this.sensible = {};
+    this.offers = [];
     for (const name of ["pause", "resume", "stop"]) $(name).onclick = () => this.send(name);
     $("abort").onclick = () => (this.armedAt === null ? this.arm() : this.confirm());
     $("abort").addEventListener("blur", () => this.disarm());
@@ -43,20 +44,16 @@ export class Commands {
     $("operator").textContent = name;
   }
 
-  // Commands that are possible now; abort, stop and emergency may still arrive while the link is lost.
+  // What the daemon would accept now, by its own word; an emergency may always be reported while it runs.
   receive({ mission, is_over }) {
-    const state = mission?.state;
     const isOn = Boolean(mission) && !is_over;
-    this.allow({
-      pause: isOn && state !== "held",
-      resume: isOn && state === "held",
-      abort: isOn && state !== "returning",
-      stop: isOn,
-      emergency: isOn,
-    });
+    const offers = isOn ? (mission.turn.offers ?? []) : [];
+    this.offers = offers;
+    this.allow({ ...Object.fromEntries(["pause", "resume", "abort", "stop"].map((name) => [name, offers.includes(name)])), emergency: isOn });
   }
 
   end() {
+    this.offers = [];
     this.allow({});
   }
 

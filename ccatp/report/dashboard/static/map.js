@@ -28,7 +28,8 @@ const LOOKS = {
 const FILLED = { obstacle: "seam" };
 
 export class MapView {
-  constructor(canvas, legend, ellipseButton) {
+  constructor(canvas, legend, ellipseButton, fitButton) {
+    this.fitButton = fitButton;
     this.canvas = canvas;
     this.legend = legend;
     const kept = Number(localStorage.getItem(KEPT));
@@ -41,6 +42,7 @@ export class MapView {
     this.scale = null; // pixels a metre; null: all of it
     this.centre = [0, 0];
     this.isFollowing = false;
+    this.isWhole = false; // the whole mirror, not only the planned points
     this.isDue = false;
     this.readInks();
     matchMedia("(prefers-color-scheme: light)").addEventListener("change", () => this.readInks());
@@ -133,6 +135,11 @@ export class MapView {
 
   bounds() {
     const { rim, points, base } = this.ground;
+    if (rim.length && points.length && !this.isWhole) {
+      const places = [...points.map((p) => p.slice(1)), ...(base ? [base] : [])];
+      const [xs, ys] = [places.map((p) => p[0]), places.map((p) => p[1])];
+      return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+    }
     const all = rim.length ? [...rim, ...this.around(rim)] : [...points.map((p) => p.slice(1)), ...this.path.rows.filter((p) => p[1] !== null).map((p) => p.slice(1)), ...this.shapes.map((s) => [s.x_m, s.y_m]), ...this.shapes.flatMap((s) => s.outline_m ?? [])];
     if (!rim.length && this.pose) all.push([this.pose.x_m, this.pose.y_m]);
     if (!all.length) return base ? [base[0] - 1, base[1] - 1, base[0] + 1, base[1] + 1] : [-1, -1, 1, 1];
@@ -178,7 +185,13 @@ export class MapView {
     this.draw();
   }
 
+  // All of the planned points; pressed again, the whole mirror, and back.
   fit() {
+    const isFitted = this.scale === null && !this.isFollowing;
+    if (isFitted) this.isWhole = !this.isWhole;
+    this.fitButton.textContent = this.isWhole ? "Points" : "All";
+    this.fitButton.setAttribute("aria-label", this.isWhole ? "Planned points" : "Whole mirror");
+    this.fitButton.title = `${this.isWhole ? "Planned points" : "Whole mirror"} (0)`;
     this.scale = null;
     this.isFollowing = false;
     this.canvas.style.touchAction = "pan-y";

@@ -3,6 +3,7 @@ import { Alarms, severity } from "./alarms.js";
 import { Commands } from "./commands.js";
 import { MapView } from "./map.js";
 import { Plots } from "./plots.js";
+import { explain, termOf } from "./terms.js";
 
 const SILENCE_MS = 800;
 const RETRY_MS = 1500;
@@ -27,13 +28,15 @@ const utc = (s) => new Date(1000 * s).toISOString();
 const day = (iso) => iso.slice(0, 10);
 const hour = (iso) => iso.slice(11, 19);
 
-const map = new MapView($("map"), $("legend"), $("ellipse"));
-const plots = new Plots((name) => $(`plot-${name}`), $("plots-all"));
+const map = new MapView($("map"), $("legend"), $("ellipse"), $("fit"));
+const plots = new Plots((name) => $(`plot-${name}`), $("plots-all"), $("engineer"), $("no-plots"));
 const commands = new Commands();
 const alarms = new Alarms(commands);
+explain(document, $("explain"));
 
 let source = null;
 let receivedAt = performance.now();
+let statusAge = null; // of the newest status when it came here, s
 let isEnded = false;
 let isDashboardGone = false;
 let isConnecting = false;
@@ -98,6 +101,7 @@ function receive(state, isAll) {
   receivedAt = performance.now();
   isEnded = isDashboardGone = false;
   $("ended").hidden = true;
+  text("utc-name", "UTC");
   show(state, isAll);
 }
 
@@ -109,23 +113,35 @@ function end(state) {
   isEnded = state.is_over;
   isDashboardGone = !isEnded;
   receivedAt = performance.now();
-  if (isEnded) showEnd(state.mission);
+  text("utc-name", "last seen, UTC"); // the clock stands from here on
+  if (isEnded) showEnd(state);
   showSilence();
   setTimeout(connect, RETRY_MS); // the next dashboard, or the next survey, may begin at the same place
 }
 
-function showEnd({ outcome, state, done, total }) {
-  text("ended", `The daemon has ended: ${outcome || `while ${state}`}, ${done} of ${total} ${words.goal} ${words.reached}.`);
+function showEnd({ mission, utc_s }) {
+  const { done, total } = mission;
+  text("ended", `The daemon ended at ${hour(utc(utc_s))} UTC, with ${done} of ${total} ${words.goal} ${words.reached}. Nothing here changes any more.`);
   $("ended").hidden = false;
 }
 
 function showSilence() {
   const silent = performance.now() - receivedAt;
+  showAge(silent / 1000);
   if (isEnded || !(isDashboardGone || silent > SILENCE_MS)) return;
   const what = isDashboardGone ? "the dashboard has ended; the survey may continue" : "the dashboard does not answer";
   showLoss([[what, silent / 1000]]);
 }
 setInterval(showSilence, 100);
+
+// Of what is shown: whoever reads an old page must see that it is old.
+function showAge(silentS) {
+  const isGone = !isEnded && (isDashboardGone || silentS > SILENCE_MS / 1000);
+  const old = statusAge === null ? "" : age(statusAge + silentS);
+  $("turn").classList.toggle("stale", isGone);
+  $("act").disabled = isGone;
+  text("age", isEnded ? "the daemon has ended" : isGone ? `no daemon answers: what is shown is ${old || "–"} old` : old && `status ${old} old`);
+}
 
 // -- what is shown ------------------------------------------------------------------------------------------------
 
@@ -141,9 +157,10 @@ function showLoss(losses) {
 function show(state, isAll) {
   showLoss(state.losses);
   showTimes(state);
+  showTurn(state);
   showMission(state);
   showFacts(state.facts);
-  showVerdict(state.verdict);
+  showVerdict(state.verdict, state.is_over);
   alarms.receive(state, isAll);
   showRobot(state);
   showGauges(state);
@@ -166,29 +183,46 @@ function showTimes({ utc_s, started, mission, is_over }) {
 // See docs/dashboard.md: a state that an operator commanded is not an alarm.
 function levelOf({ mission, losses, alarms: list }) {
   const isGrave = list.some((alarm) => !alarm.ended && ["hold", "return", "fault"].includes(alarm.severity));
-  if (losses.length || (mission.state === "done" && mission.exit_status > 0)) return "bad";
-  if (mission.state === "idle") return isGrave ? "bad" : "";
-  if (["held", "backing off", "returning"].includes(mission.state)) return isGrave ? "bad" : mission.is_by_operator ? "note" : "warn";
-  return "good";
+  if (losses.length) return "bad";
+  if (mission.exit_status === 0) return "good";
+  const { kind } = mission.turn;
+  const isQuiet = ["ready", "work"].includes(kind) || (!kind && !["held", "backing off", "returning", "done"].includes(mission.state));
+  if (isQuiet) return isGrave && kind === "ready" ? "bad" : mission.state === "idle" ? "" : "good";
+  return isGrave ? "bad" : mission.is_by_operator ? "note" : "warn";
 }
+
+// One line: what the robot does and why, who acts next, the next action; a button only if the daemon would accept it.
+function showTurn(state) {
+  const { mission, is_over } = state;
+  if (!mission) {
+    text("state", "waiting for the main loop");
+    text("next", "");
+    return;
+  }
+  statusAge = mission.age_s;
+  const { does, who, then, request } = mission.turn_text;
+  text("state", does);
+  $("state").dataset.level = levelOf(state);
+  $("state").classList.toggle("stale", mission.is_stale);
+  text("next", then ? `Next: ${who} ${then}`.replace(/ +/g, " ") : "");
+  $("turn").dataset.actor = mission.turn.actor;
+  $("act").hidden = is_over || !request || !commands.token;
+  text("act", { resume: "Resume", clear: "Clear …" }[request] ?? "");
+  $("act").onclick = () => (request === "clear" ? alarms.clearFirst() : commands.press(request));
+}
+
+// Time to the end means something only while the mission makes progress.
+const isUnderWay = ({ mission, is_over }) => !is_over && !mission.outcome && ["", "work", "retreat", undefined].includes(mission.turn.kind) && mission.state !== "returning";
 
 function showMission(state) {
   const { mission } = state;
-  if (!mission) {
-    text("state", "waiting for the main loop");
-    return;
-  }
-  const level = levelOf(state);
-  const cause = !mission.cause ? "" : mission.is_by_operator && level === "note" ? " by an operator" : `: ${mission.cause}`;
-  text("state", mission.outcome ? `done: ${mission.outcome}` : mission.state + cause);
-  $("state").dataset.level = level;
-  $("state").classList.toggle("stale", mission.is_stale);
+  if (!mission) return;
   text("done", String(mission.done));
   text("total", String(mission.total));
   $("progress").max = Math.max(mission.total, 1);
   $("progress").value = mission.done;
   text("elapsed", clock(mission.elapsed_s));
-  text("eta", mission.outcome || mission.state === "returning" ? "–" : clock(mission.eta_s));
+  text("eta", isUnderWay(state) ? clock(mission.eta_s) : "–");
   text("point", mission.next_point || "–");
   text("arrival", mission.done ? `${mission.error_mm.toFixed(2)} mm` : "–");
   text("skipped", String(Math.max(mission.skipped, mission.not_to_be_measured)));
@@ -214,16 +248,18 @@ function showFacts(facts) {
   }));
 }
 
-function showVerdict(verdict) {
+// The event code and the severity of what is found are two things; after the end nothing is permitted or denied.
+function showVerdict(verdict, isOver) {
   if (!verdict) return;
-  const level = verdict.code === 2 || verdict.severity >= HOLD ? "bad" : verdict.code || verdict.severity ? "warn" : "good";
-  const grave = verdict.severity ? `, ${severity(verdict.severity)}` : "";
-  text("verdict", `${verdict.code} ${codes[verdict.code] ?? ""}${grave}${verdict.text ? `: ${verdict.text}` : ""}`);
+  const level = verdict.severity >= HOLD ? "bad" : verdict.text || verdict.severity ? "warn" : "good";
+  const grave = verdict.severity ? `${severity(verdict.severity)}: ` : "";
+  text("verdict", verdict.text ? `${grave}${verdict.text}` : "nothing found");
+  text("code", `${verdict.code} ${codes[verdict.code] ?? ""}`);
   $("verdict").dataset.level = level;
-  $("verdict").classList.toggle("stale", Boolean(verdict.is_stale));
+  $("verdict").classList.toggle("stale", Boolean(verdict.is_stale) || isOver);
   for (const way of ["forward", "reverse", "turn"]) {
     const is = verdict[way];
-    $(`permit-${way}`).dataset.on = is === undefined ? "" : is && !verdict.is_stale ? "yes" : "no";
+    $(`permit-${way}`).dataset.on = is === undefined || isOver ? "" : is && !verdict.is_stale ? "yes" : "no";
   }
 }
 
@@ -248,7 +284,7 @@ function showRobot({ robot, pose, mission }) {
 }
 
 // For each value: name, value, limit, whether it must be above the limit, range of the bar, format.
-function showGauges({ robot, laser, sensors_age_s }) {
+function showGauges({ robot, laser, sensors_age_s, mission }) {
   const percent = (value) => `${Math.round(100 * value)} %`;
   const ms = (value) => (value < 0.9995 ? `${Math.round(1000 * value)} ms` : `${value.toFixed(1)} s`);
   const fan = (k) => [`fan ${["left", "right"][k]}`, robot?.fans[k], limits.fan_share ? limits.fan_share * limits.fan_duty[k] : null, true, 1, percent];
@@ -260,6 +296,7 @@ function showGauges({ robot, laser, sensors_age_s }) {
           ["laser residual", laser?.residual_um, limits.residual_um, false, 1.3 * limits.residual_um, (value) => `${value.toFixed(value < 10 ? 1 : 0)} µm`],
         ]
       : []),
+    ...("grip" in limits ? [["grip", mission?.grip || null, limits.grip, true, 3 * limits.grip, (value) => `${value.toFixed(1)} ×`]] : []),
     ["sensors, age", sensors_age_s, limits.sensors_age_s, false, 1.3 * limits.sensors_age_s, ms],
     ["permit, age", robot?.permit_age_s, limits.permit_age_s, false, 1.3 * limits.permit_age_s, ms],
     ["drive, age", robot?.drive_age_s, limits.drive_age_s, false, 1.3 * (limits.drive_age_s ?? limits.permit_age_s), ms],
@@ -276,7 +313,12 @@ function showGauges({ robot, laser, sensors_age_s }) {
     const isBad = isKnown && limit != null && (isLeast ? value < limit : value > limit);
     const [head, bar, words] = row.children;
     row.dataset.level = isBad ? "bad" : "";
-    head.textContent = name;
+    if (head.textContent !== name) {
+      head.textContent = name;
+      const term = termOf(name);
+      if (term) head.dataset.term = term;
+      else delete head.dataset.term;
+    }
     bar.children[0].style.width = `${isKnown ? Math.min((100 * value) / most, 100) : 0}%`;
     bar.children[1].hidden = limit == null;
     if (limit != null) bar.children[1].style.left = `${(100 * limit) / most}%`;

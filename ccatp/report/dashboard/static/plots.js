@@ -7,6 +7,7 @@ const LEAST_HEIGHT = 90;
 const LEAST_VALUE = 1e-3; // a logarithm has no zero
 const NEAR = 1000; // a limit that is further away than so many times the largest value is not drawn
 const TIME_STEPS_S = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800];
+const KEPT = "ccatp-engineer";
 const two = (n) => String(n).padStart(2, "0");
 const time = (s) => {
   const all = Math.max(Math.round(s), 0);
@@ -49,7 +50,7 @@ const LOOKS = {
 const SHAPE = { nis: ([t, nis, size]) => [t, nis === null ? null : nis / size] };
 
 export class Plots {
-  constructor(placeOf, allButton) {
+  constructor(placeOf, allButton, engineerBox, emptyNote) {
     this.placeOf = placeOf;
     this.names = [];
     this.lines = {};
@@ -61,6 +62,13 @@ export class Plots {
     this.window = null; // the time that is zoomed to
     this.allButton = allButton;
     allButton.onclick = () => this.zoom(null);
+    this.engineerBox = engineerBox;
+    this.emptyNote = emptyNote;
+    engineerBox.checked = localStorage.getItem(KEPT) === "yes";
+    engineerBox.onchange = () => {
+      localStorage.setItem(KEPT, engineerBox.checked ? "yes" : "no");
+      this.showFigures();
+    };
     matchMedia("(prefers-color-scheme: light)").addEventListener("change", () => this.build());
     this.observer = new ResizeObserver(() => this.resize());
   }
@@ -79,9 +87,18 @@ export class Plots {
     this.places = Object.fromEntries(names.map((name) => [name, this.placeOf(name)]));
     this.plots = {};
     this.observer.disconnect();
-    for (const name of names) this.places[name].closest("figure").hidden = false;
+    this.showFigures();
     this.build();
     for (const name of names) this.observer.observe(this.places[name]);
+  }
+
+  // An empty plot takes no room, and those for engineers are shown to whom wants them.
+  showFigures() {
+    const figures = this.names.map((name) => [name, this.places[name].closest("figure")]);
+    const isFor = (figure) => this.engineerBox.checked || !("engineer" in figure.dataset);
+    for (const [name, figure] of figures) figure.hidden = !this.history[name].rows.length || !isFor(figure);
+    this.engineerBox.closest("label").hidden = !figures.some(([, figure]) => "engineer" in figure.dataset);
+    this.emptyNote.hidden = figures.some(([, figure]) => !figure.hidden);
   }
 
   build() {
@@ -211,6 +228,7 @@ export class Plots {
     const now = performance.now();
     if (!this.dirty.size || (now - this.drawnAt < REDRAW_MS && !isAll)) return;
     this.drawnAt = now;
+    this.showFigures();
     for (const name of this.names) this.draw(name); // the others show the same time
     this.dirty.clear();
   }

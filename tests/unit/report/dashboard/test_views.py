@@ -175,7 +175,7 @@ def test_the_verdict_and_its_cause(view: SurveyView) -> None:
     assert (state["verdict"]["code"], "forward" in state["verdict"]) == (2, False)
 
 
-def test_the_alarms_are_those_of_the_status_until_the_run_is_over(view: SurveyView) -> None:
+def test_the_alarms_are_those_of_the_status_also_after_the_end(view: SurveyView) -> None:
     assert reported(view)["alarms"] == []
     alarm = Alarm(
         name="no_way_on", severity="fault", cause="no way on: rim", advice="carry it", since="now", since_s=1.0
@@ -183,7 +183,8 @@ def test_the_alarms_are_those_of_the_status_until_the_run_is_over(view: SurveyVi
     state = reported(view, mission(state="held", alarms=[alarm]))
     assert state["alarms"] == [msgspec.to_builtins(alarm)]
     assert "alarms" not in state["mission"]
-    assert reported(view, mission(alarms=[alarm], exit_status=0))["alarms"] == []
+    ended = reported(view, mission(alarms=[alarm], exit_status=4))
+    assert (ended["is_over"], ended["alarms"]) == (True, [msgspec.to_builtins(alarm)])
 
 
 def test_other_things_on_the_map(view: SurveyView) -> None:
