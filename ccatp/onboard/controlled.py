@@ -68,10 +68,10 @@ class ControlledRobot(LinkedRobot):
         drive_seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
         return CommandEcho(drive_seq, round(age_s, 6), round(permit_age_s, 6), is_held)
 
-    def _take_samples(self, samples: list[Row], since_s: float) -> list[Row]:
+    def _take_samples(self, samples: list[Row], since_s: float, most: int = LINE_SAMPLES) -> list[Row]:
         """Remove and return the samples of the frame; later ones stay in ``samples``."""
         end = next((k for k, row in enumerate(samples) if row[0] > self.t_s + SAME_S), len(samples))
         due, samples[:] = samples[:end], samples[end:]
-        found = [row for row in due if row[0] > since_s + SAME_S or not since_s][-LINE_SAMPLES:]
+        found = [row for row in due if row[0] > since_s + SAME_S or not since_s][-most:]
         self.dropped_samples += end - len(found)
         return found

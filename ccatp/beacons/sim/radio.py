@@ -183,12 +183,13 @@ class TrueRadio:
 
     def scan(self, pose: TruePose, sender_m: Point) -> list[float | None]:
         """Levels of one turn of the reflector, dBm, in the order of its steps; None for lost packets."""
-        rays, levels_dbm = self.rays(pose, sender_m), list[float | None]()
-        for index in range(self._readings):
-            direction_rad = wrap_pi(index * self._step_rad)
-            milliwatt = sum(10.0 ** (0.1 * (ray.level_dbm + self._gain_db(ray, direction_rad))) for ray in rays)
-            levels_dbm.append(self._received(10.0 * log10(milliwatt)))
-        return levels_dbm
+        return [self.level(pose, sender_m, wrap_pi(index * self._step_rad)) for index in range(self._readings)]
+
+    def level(self, pose: TruePose, sender_m: Point, direction_rad: float) -> float | None:
+        """One reading with the reflector in a direction, rad left of the heading, dBm; None for a lost packet."""
+        rays = self.rays(pose, sender_m)
+        milliwatt = sum(10.0 ** (0.1 * (ray.level_dbm + self._gain_db(ray, direction_rad))) for ray in rays)
+        return self._received(10.0 * log10(milliwatt))
 
     def _path_dbm(self, distance_m: float) -> float:
         return self._reference_dbm - 10.0 * self._cfg.exponent * log10(distance_m)

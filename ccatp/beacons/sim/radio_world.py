@@ -151,6 +151,14 @@ class RadioWorld:
         incidents = [one for one in self._cfg.sim.incidents if isinstance(one, kind)]
         return [one for one in incidents if one.at_s <= self.time_s < one.at_s + one.for_s]
 
+    def level(self, name: str, direction_rad: float) -> float | None:
+        """Level of a radio with the reflector in a direction, dBm; None for a lost packet."""
+        place_m = self.target_m if name == self._cfg.follow.target else self.beacons_m[name]
+        losses = self._lasting(RadioLossConfig)
+        if place_m is None or any(not one.beacons or name in one.beacons for one in losses):
+            return None
+        return self._radios[name].level(self.pose, place_m, direction_rad)
+
     def _receive(self, *, static: bool, target: bool) -> tuple[list[RadioSample], RadioScan | None]:
         """Drawn results of scans, or the levels of one turn of the reflector."""
         places = dict(self.beacons_m) if static else {}

@@ -30,17 +30,38 @@ _LAYOUT, _RECEIVER = 20, 21
 BeaconTruthRow = tuple[int, float, float, float, float, float | None, float | None, float | None]
 
 
-class BeaconRobot(SimulatedRobot):
-    """The simulated robot; fan commands have no effect on its motion."""
+class SimulatedBeaconRobot(SimulatedRobot):
+    """A robot in the true world of beacons."""
 
+    world: RadioWorld
+    motes: TrueMotes | None
+    seq: int
+    t_s: float
     truth_rows = 50
 
+    def truth_row(self) -> BeaconTruthRow:
+        world = self.world
+        target_x_m, target_y_m = world.target_m or (None, None)
+        clearance_m = world.clearance_m if world.clearance_m < inf else None
+        return self.seq, self.t_s, *world.pose, target_x_m, target_y_m, clearance_m
+
+    def truth_message(self, rows: list[BeaconTruthRow]) -> tuple[str, BeaconTruth]:
+        return "beacon_truth", BeaconTruth(seq=self.seq, t_s=self.t_s, rows=rows)
+
+    def truth_preface(self) -> tuple[str, BeaconPlaces]:
+        places = dict(self.world.beacons_m)
+        if self.motes is not None:
+            for name, place in zip(self.motes.names, self.motes.positions_m.tolist(), strict=True):
+                places[name] = place[0], place[1]
+        return "beacon_places", BeaconPlaces(seq=self.seq, t_s=self.t_s, places=places)
+
+
+class BeaconRobot(SimulatedBeaconRobot):
+    """The simulated robot; fan commands have no effect on its motion."""
+
     def __init__(self, cfg: RadioConfig, world: RadioWorld, motes: TrueMotes | None = None) -> None:
-        self._cfg, self.world, self._motes = cfg, world, motes
-        self._listener: MoteListener | None = None
-        if motes is not None:
-            rng = np.random.default_rng([cfg.run.seed, _RECEIVER])
-            self._listener = MoteListener(cfg.cricket, cfg.listener, motes, rng)
+        self._cfg, self.world, self.motes = cfg, world, motes
+        self._listener = None if motes is None else listener_of(cfg, motes)
         limits = cfg.sim.robot.ttl_s, cfg.robot.max_wheel_rad_s, 0.0
         super().__init__(limits, cfg.run.step_s, 1.0 / cfg.run.step_s)
         self.is_steerable = cfg.vehicle.kind == "ackermann"
@@ -71,22 +92,6 @@ class BeaconRobot(SimulatedRobot):
     @property
     def delivered_line(self) -> bytes:
         return self._line
-
-    def truth_row(self) -> BeaconTruthRow:
-        world = self.world
-        target_x_m, target_y_m = world.target_m or (None, None)
-        clearance_m = world.clearance_m if world.clearance_m < inf else None
-        return self.seq, self.t_s, *world.pose, target_x_m, target_y_m, clearance_m
-
-    def truth_message(self, rows: list[BeaconTruthRow]) -> tuple[str, BeaconTruth]:
-        return "beacon_truth", BeaconTruth(seq=self.seq, t_s=self.t_s, rows=rows)
-
-    def truth_preface(self) -> tuple[str, BeaconPlaces]:
-        places = dict(self.world.beacons_m)
-        if self._motes is not None:
-            for name, place in zip(self._motes.names, self._motes.positions_m.tolist(), strict=True):
-                places[name] = place[0], place[1]
-        return "beacon_places", BeaconPlaces(seq=self.seq, t_s=self.t_s, places=places)
 
     def advance(self) -> None:
         self.seq += 1
@@ -128,9 +133,16 @@ class BeaconRobot(SimulatedRobot):
         self._line = with_extras(encode(line), extras)
 
 
+def motes_of(cfg: RadioConfig) -> TrueMotes | None:
+    """The motes of a configuration; None without."""
+    return true_motes(cfg.cricket, np.random.default_rng([cfg.run.seed, _LAYOUT])) if cfg.system == "cricket" else None
+
+
+def listener_of(cfg: RadioConfig, motes: TrueMotes) -> MoteListener:
+    """What the listeners among the motes receive."""
+    return MoteListener(cfg.cricket, cfg.listener, motes, np.random.default_rng([cfg.run.seed, _RECEIVER]))
+
+
 def build_beacon_robot(cfg: RadioConfig) -> BeaconRobot:
     """The robot of a configuration, just booted."""
-    motes = None
-    if cfg.system == "cricket":
-        motes = true_motes(cfg.cricket, np.random.default_rng([cfg.run.seed, _LAYOUT]))
-    return BeaconRobot(cfg, RadioWorld(cfg), motes)
+    return BeaconRobot(cfg, RadioWorld(cfg), motes_of(cfg))

@@ -26,7 +26,7 @@ from ccatp.beacons.mission import BeaconMission, TrackRow, track_row, wheel_rate
 from ccatp.beacons.navigation import MeasurementReader
 from ccatp.beacons.records.summary import BeaconSummary
 from ccatp.beacons.safety.rules import BeaconSafetyRules
-from ccatp.beacons.sim.robot import build_beacon_robot
+from ccatp.beacons.sim.robot import SimulatedBeaconRobot, build_beacon_robot
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.conditions import text_of
 from ccatp.core import FloatArray, Verdict
@@ -62,11 +62,11 @@ class BeaconSilResult:
 
 
 class BeaconSilWorld:
-    """Simulated robot, danger rules and mission, stepped frame by frame."""
+    """Simulated robot (by default that of the configuration), danger rules and mission, stepped frame by frame."""
 
-    def __init__(self, cfg: RadioConfig) -> None:
+    def __init__(self, cfg: RadioConfig, robot: SimulatedBeaconRobot | None = None) -> None:
         self._cfg = cfg
-        self.robot = build_beacon_robot(cfg)
+        self.robot: SimulatedBeaconRobot = build_beacon_robot(cfg) if robot is None else robot
         self.mission, self.danger = BeaconMission(cfg), BeaconSafetyRules(cfg)
         self.found = BeaconSilResult(truth=[self.robot.truth_row()])
         self._reader = MeasurementReader(cfg)

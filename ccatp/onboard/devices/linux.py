@@ -88,9 +88,9 @@ def open_serial(device: str, baud: int, key: str = "devices.daq") -> SerialPort:
 class GpioLines:
     """Output lines of a GPIO chip; OutputLines."""
 
-    def __init__(self, chip: str, values: Mapping[int, bool]) -> None:
+    def __init__(self, chip: str, values: Mapping[int, bool], key: str = _LINES_KEY) -> None:
         gpiod = import_package("gpiod")
-        self._chip = chip
+        self._chip, self._key = chip, key
         self._levels = gpiod.line.Value.INACTIVE, gpiod.line.Value.ACTIVE
         output = gpiod.line.Direction.OUTPUT
         settings = {
@@ -100,13 +100,35 @@ class GpioLines:
         try:
             self._request = gpiod.request_lines(chip, consumer="ccatp", config=settings)
         except (OSError, ValueError) as error:
-            raise explain(error, chip, "gpio", _LINES_KEY) from None
+            raise explain(error, chip, "gpio", key) from None
 
     def set(self, values: Mapping[int, bool]) -> None:
         try:
             self._request.set_values({line: self._levels[is_high] for line, is_high in values.items()})
         except OSError as error:
-            raise explain(error, self._chip, "gpio", _LINES_KEY) from None
+            raise explain(error, self._chip, "gpio", self._key) from None
+
+    def close(self) -> None:
+        self._request.release()
+
+
+class GpioInput:
+    """An input line of a GPIO chip. ``key``: the part of the configuration."""
+
+    def __init__(self, chip: str, line: int, key: str) -> None:
+        gpiod = import_package("gpiod")
+        self._chip, self._line, self._key, self._active = chip, line, key, gpiod.line.Value.ACTIVE
+        settings = gpiod.LineSettings(direction=gpiod.line.Direction.INPUT)
+        try:
+            self._request = gpiod.request_lines(chip, consumer="ccatp", config={line: settings})
+        except (OSError, ValueError) as error:
+            raise explain(error, chip, "gpio", key) from None
+
+    def get(self) -> bool:
+        try:
+            return bool(self._request.get_value(self._line) == self._active)
+        except OSError as error:
+            raise explain(error, self._chip, "gpio", self._key) from None
 
     def close(self) -> None:
         self._request.release()

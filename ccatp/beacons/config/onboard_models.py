@@ -1,0 +1,152 @@
+"""Frozen configuration models of the on-board program of a robot among beacons.
+
+Values live in ``configs/beacon_onboard.toml``.
+"""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from ccatp.beacons.config.models import Angle, Name
+from ccatp.config.checks import check_top_speed, problem_of
+from ccatp.config.messages import ConfigProblem
+from ccatp.config.models import Model, NonNegative, Positive, Text
+from ccatp.config.onboard_models import Line, OnboardLinkConfig
+from ccatp.config.robot_limits import VEHICLE_FRAME_HZ, WheelBase, WheelRadius
+
+ListenerName = Annotated[Name, Field(max_length=16)]  # many of them share a line of the link
+Baud = Annotated[int, Field(ge=1200, le=921_600)]
+Celsius = Annotated[float, Field(ge=-60.0, le=80.0)]
+_STEPS_OF_WATCHDOG = 5  # of the control loop, in the time of the base's watchdog: one may be late
+
+
+class BeaconLinkConfig(OnboardLinkConfig):
+    """The robot link; a robot with a vehicle may send fewer frames."""
+
+    frame_hz: Annotated[float, Field(ge=VEHICLE_FRAME_HZ.low, le=VEHICLE_FRAME_HZ.high)]
+
+
+class BeaconBodyConfig(Model):
+    """Data of the robot in the hello."""
+
+    wheel_radius_m: WheelRadius
+    track_m: WheelBase
+    axle_distance_m: Positive  # of a robot with two driven wheels: not used, the same as vehicle.wheelbase_m
+    max_wheel_rad_s: Positive
+    loop_hz: Annotated[float, Field(ge=20.0, le=1000.0)]
+
+
+class ScanTimesConfig(Model):
+    """When the robot stands and listens to radios."""
+
+    every_s: NonNegative  # between two scans; 0: never
+    standing_s: Positive  # the wheels must stand for this long before
+    standing_rad_s: Positive  # wheels that turn more slowly stand
+
+
+class RadioDeviceConfig(Model):
+    """The XBee that is the coordinator of the network."""
+
+    is_used: bool
+    device: Text
+    baud: Baud
+    api_mode: Literal[1, 2]
+    names: tuple[Name, ...]  # node identifiers of the radios; empty: all that are found
+    discovery_s: Positive
+    answer_timeout_s: Positive
+    tries: Annotated[int, Field(ge=1, le=20)]
+
+
+class DishConfig(Model):
+    """The reflector on its stepper motor; lines of one GPIO chip."""
+
+    is_used: bool
+    gpio_chip: Text
+    step_line: Line
+    direction_line: Line
+    left_is_high: bool  # level of the direction line for a turn to the left, seen from above
+    homing: Literal["switch", "hand"]
+    switch_line: Line
+    switch_is_high: bool
+    steps_per_turn: Annotated[int, Field(ge=4, le=100_000)]
+    positions: Annotated[int, Field(ge=4, le=720)]
+    step_s: Positive  # between two steps
+    settle_s: NonNegative  # after the last step to a position
+    tolerance_steps: Annotated[int, Field(ge=0)]  # by which the end switch may be missed
+
+
+class BaseDeviceConfig(Model):
+    """The Pioneer base."""
+
+    is_used: bool
+    device: Text
+    baud: Baud
+    timeout_s: Positive
+    counts_per_mm: Positive  # of an encoder, for the travel of its wheel
+    acceleration_m_s2: Positive
+    turn_acceleration_rad_s2: Positive
+    most_watchdog_s: Positive
+    battery_empty_v: Positive
+    battery_full_v: Positive
+    sonars: tuple[Annotated[int, Field(ge=0, le=31)], ...]  # numbers, in the order of sonars_rad
+    sonars_rad: tuple[Angle, ...]
+    sonar_max_m: Positive  # what a sonar without an echo reads
+    sonar_timeout_s: Positive
+
+
+class ListenersConfig(Model):
+    """Cricket motes as listeners on serial lines, by the name of the listener."""
+
+    is_used: bool
+    devices: dict[ListenerName, Text]
+    baud: Baud
+    timeout_s: Positive  # a listener without a line for longer is reported
+    temperature_c: Celsius  # of a mote whose thermometer is off
+
+
+class BeaconDevicesConfig(Model):
+    """The devices; each can be left out."""
+
+    base: BaseDeviceConfig
+    radio: RadioDeviceConfig
+    dish: DishConfig
+    listeners: ListenersConfig
+
+
+class BeaconOnboardConfig(Model):
+    """The whole configuration."""
+
+    kind: Literal["beacons"]
+    link: BeaconLinkConfig
+    robot: BeaconBodyConfig
+    scan: ScanTimesConfig
+    devices: BeaconDevicesConfig
+
+
+def check_beacon_onboard_config(cfg: BeaconOnboardConfig) -> Iterator[ConfigProblem]:
+    """Everything wrong with a configuration whose values are each in range."""
+    link, body, devices = cfg.link, cfg.robot, cfg.devices
+    base, dish = devices.base, devices.dish
+    least_s = _STEPS_OF_WATCHDOG / body.loop_hz
+    yield from check_top_speed(body)
+    for is_wrong, key, what, *related in (
+        (link.frame_hz * link.ttl_s < 2.0, "link.ttl_s", "must last for two frames at least", "link.frame_hz"),
+        (body.loop_hz < link.frame_hz, "robot.loop_hz", "must not be below link.frame_hz", "link.frame_hz"),
+        (base.most_watchdog_s < least_s, "devices.base.most_watchdog_s",
+         f"stops a loop with steps of {1.0 / body.loop_hz:g} s; allow {least_s:g} at least", "robot.loop_hz"),
+        (base.battery_empty_v >= base.battery_full_v, "devices.base.battery_empty_v",
+         "must be below devices.base.battery_full_v", "devices.base.battery_full_v"),
+        (len(base.sonars) != len(base.sonars_rad), "devices.base.sonars_rad", "needs a direction for each of sonars",
+         "devices.base.sonars"),
+        (dish.is_used and not devices.radio.is_used, "devices.dish.is_used", "needs devices.radio",
+         "devices.radio.is_used"),
+        (dish.steps_per_turn % dish.positions != 0, "devices.dish.positions",
+         f"must divide steps_per_turn = {dish.steps_per_turn}", "devices.dish.steps_per_turn"),
+        (len({dish.step_line, dish.direction_line, dish.switch_line}) < 3, "devices.dish.step_line",
+         "names a line twice", "devices.dish.direction_line", "devices.dish.switch_line"),
+        (devices.listeners.is_used and not devices.listeners.devices, "devices.listeners.devices",
+         "names no listener", "devices.listeners.is_used"),
+    ):  # fmt: skip
+        if is_wrong:
+            yield problem_of(key, what, *related)

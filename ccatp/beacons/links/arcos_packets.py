@@ -1,0 +1,153 @@
+"""Packets of a Pioneer base with ARCOS: commands to bytes, bytes to packets, packets to what they say.
+
+A packet is FA FB, the number of bytes that follow, its type or command, its data (numbers with the low byte first), and
+a check sum (two bytes, high byte first). Names, numbers and layouts are those of the Pioneer 3 Operations Manual.
+"""
+
+import struct
+from collections import Counter
+from typing import NamedTuple
+
+HEADER = b"\xfa\xfb"
+LONGEST = 208  # bytes after the count; a larger count is noise
+_POSITIVE, _NEGATIVE = 0x3B, 0x1B  # types of a number in a command
+
+# Commands. PULSE has the number of SYNC0, OPEN that of SYNC1.
+SYNC0, SYNC1, SYNC2 = 0, 1, 2
+PULSE, OPEN, CLOSE, ENABLE, SETA, VEL, CONFIG, ENCODER, RVEL, SETRA, SONAR = 0, 1, 2, 4, 5, 11, 18, 19, 21, 23, 28
+CONFIG_PACKET, ENCODER_PACKET = 0x20, 0x90
+STANDARD_PACKETS = frozenset((0x32, 0x33))  # motors stopped, robot moving
+_STANDARD = struct.Struct("<HHhhhBBBhHBB")
+_READING = struct.Struct("<BH")
+_ENCODERS = struct.Struct("<ii")
+_MOTORS_ENABLED = 0x0001
+
+
+class Standard(NamedTuple):
+    """The packet of each cycle; ``sonars``: number and range, mm, of each new reading.
+
+    ``stalls``, ``bumpers``: of the left and the right wheel; of the bumpers at the front and at the rear, as bits.
+    """
+
+    left_mm_s: int
+    right_mm_s: int
+    battery_v: float
+    stalls: tuple[bool, bool]
+    bumpers: tuple[int, int]
+    is_enabled: bool
+    sonars: tuple[tuple[int, int], ...]
+
+
+class BaseConfig(NamedTuple):
+    """What the base says of itself: type, model, its watchdog, ticks of an encoder for a millimetre of travel."""
+
+    kind: str
+    model: str
+    watchdog_ms: int
+
+
+def check_sum(data: bytes) -> int:
+    """Sum of the byte pairs, high byte first; a single last byte is XORed."""
+    pairs = len(data) // 2 * 2
+    total = sum(data[k] << 8 | data[k + 1] for k in range(0, pairs, 2)) & 0xFFFF
+    return total ^ data[-1] if len(data) % 2 else total
+
+
+def format_packet(data: bytes) -> bytes:
+    """A packet as bytes; ``data``: type or command, and what follows."""
+    return HEADER + bytes([len(data) + 2]) + data + check_sum(data).to_bytes(2)
+
+
+def format_command(command: int, value: int | None = None) -> bytes:
+    """A command without or with a number, -32767 to 32767."""
+    if value is None:
+        return format_packet(bytes([command]))
+    kind = _NEGATIVE if value < 0 else _POSITIVE
+    return format_packet(bytes([command, kind]) + abs(value).to_bytes(2, "little"))
+
+
+class PacketReader:
+    """Finds the packets in bytes that arrive in pieces of any size; it stores less than one packet.
+
+    Attributes:
+        counts: ``packets``, ``bad_sums``, ``noise`` (bytes).
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.counts: Counter[str] = Counter()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Type and data of each packet that is complete now."""
+        buffer, packets = self._buffer, list[bytes]()
+        buffer += data
+        while (start := buffer.find(HEADER)) >= 0:
+            self._drop(start)
+            if len(buffer) < 3:
+                return packets
+            size = buffer[2]
+            if not 3 <= size <= LONGEST:
+                self._drop(1)
+                continue
+            if len(buffer) < 3 + size:
+                return packets
+            body = bytes(buffer[3 : 1 + size])
+            if check_sum(body) != int.from_bytes(buffer[1 + size : 3 + size]):
+                self.counts["bad_sums"] += 1
+                self._drop(1)
+                continue
+            packets.append(body)
+            self.counts["packets"] += 1
+            del buffer[: 3 + size]
+        self._drop(len(buffer) - buffer.endswith(HEADER[:1]))
+        return packets
+
+    def _drop(self, count: int) -> None:
+        self.counts["noise"] += count
+        del self._buffer[:count]
+
+
+def parse_standard(packet: bytes) -> Standard | None:
+    """A standard packet; None if it is none, or has not all of its sonar readings."""
+    if packet[0] not in STANDARD_PACKETS or len(packet) < 1 + _STANDARD.size:
+        return None
+    _, _, _, left, right, battery, left_bits, right_bits, _, flags, _, count = _STANDARD.unpack_from(packet, 1)
+    start = 1 + _STANDARD.size
+    if len(packet) < start + count * _READING.size:
+        return None
+    sonars = tuple(_READING.unpack_from(packet, start + k * _READING.size) for k in range(count))
+    stalls, bumpers = (bool(left_bits & 1), bool(right_bits & 1)), (left_bits >> 1, right_bits >> 1)
+    return Standard(left, right, 0.1 * battery, stalls, bumpers, bool(flags & _MOTORS_ENABLED), sonars)
+
+
+def parse_encoders(packet: bytes) -> tuple[int, int] | None:
+    """Counts of the left and the right encoder, which wrap; None if it is no such packet."""
+    if packet[0] != ENCODER_PACKET or len(packet) < 1 + _ENCODERS.size:
+        return None
+    left, right = _ENCODERS.unpack_from(packet, 1)
+    return left, right
+
+
+def parse_names(packet: bytes) -> tuple[str, str, str]:
+    """Name, class and subclass in the answer to ``SYNC2``; empty where they are missing."""
+    name, kind, model, *_ = [*(text.decode("ascii", "replace") for text in packet[1:].split(b"\0")), "", "", ""]
+    return name, kind, model
+
+
+# Between the serial number and the name: one byte, five numbers. Between the name and the watchdog: SIP cycle, three
+# bytes for baud rates without the last, gripper (2), front sonar (2), rear sonar (1), low battery (2), RevCount (2).
+_BEFORE_NAME, _BEFORE_WATCHDOG = 1 + 5 * 2, 3 + 2 + 2 + 1 + 2 + 2
+
+
+def parse_config(packet: bytes) -> BaseConfig | None:
+    """The packet that answers ``CONFIG``; None if it is none or too short."""
+    if packet[0] != CONFIG_PACKET:
+        return None
+    kind, _, rest = packet[1:].partition(b"\0")
+    model, _, rest = rest.partition(b"\0")
+    _, _, rest = rest.partition(b"\0")
+    _, zero, rest = rest[_BEFORE_NAME:].partition(b"\0")
+    if not zero or len(rest) < _BEFORE_WATCHDOG + 2:
+        return None
+    watchdog_ms = int.from_bytes(rest[_BEFORE_WATCHDOG : _BEFORE_WATCHDOG + 2], "little")
+    return BaseConfig(kind.decode("ascii", "replace"), model.decode("ascii", "replace"), watchdog_ms)

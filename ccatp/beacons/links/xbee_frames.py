@@ -1,0 +1,193 @@
+"""Frames of XBee modules in API mode 1 and 2: bytes to frames, frames to what they say, commands to bytes.
+
+A frame is 7E, the length of its data (two bytes, high byte first), the data, and FF minus the sum of the data. In mode
+2 the bytes 7E, 7D, 11 and 13 of length, data and sum are sent as 7D and the byte XOR 20, so 7E always begins a frame.
+The numbers of the frame types and the layouts are those of Digi's manuals of the S1, S2C and XBee 3 modules.
+"""
+
+from collections import Counter
+from typing import NamedTuple
+
+START, ESCAPE, FLIP = 0x7E, 0x7D, 0x20
+ESCAPED = frozenset((START, ESCAPE, 0x11, 0x13))
+LONGEST = 300  # bytes of data; a longer length is noise, and would hold up the frames behind it
+
+AT, REMOTE_AT = 0x08, 0x17
+AT_RESPONSE, MODEM_STATUS, REMOTE_RESPONSE, ROUTE_RECORD = 0x88, 0x8A, 0x97, 0xA1
+# Frames about a packet that came by radio: any of them changes what the command DB answers.
+BY_RADIO = frozenset((0x80, 0x81, 0x82, 0x83, 0x90, 0x91, 0x92, 0x94, 0x95, REMOTE_RESPONSE, 0xA0, ROUTE_RECORD, 0xA3))
+RESETS = frozenset((0x00, 0x01))  # modem status: hardware reset, watchdog timer reset
+OK = 0
+_END_DEVICE = 2
+_COORDINATORS = frozenset((0x0000, 0xFFFE))  # parent of a node that no other node stands between
+
+
+class AtResponse(NamedTuple):
+    """Answer of the own module to a command."""
+
+    frame_id: int
+    command: bytes
+    status: int
+    data: bytes
+
+
+class RemoteResponse(NamedTuple):
+    """Answer of another module to a command; ``address``: its serial number."""
+
+    frame_id: int
+    address: int
+    command: bytes
+    status: int
+    data: bytes
+
+
+class ModemStatus(NamedTuple):
+    """The own module reports an event."""
+
+    status: int
+
+
+class RouteRecord(NamedTuple):
+    """Number of modules that relay the packets of a module."""
+
+    address: int
+    relays: int
+
+
+class OtherFrame(NamedTuple):
+    """Any other frame."""
+
+    kind: int
+
+
+Message = AtResponse | RemoteResponse | ModemStatus | RouteRecord | OtherFrame
+
+
+class Node(NamedTuple):
+    """A module that answered the node discovery; ``is_relayed``: its packets come by way of another module."""
+
+    address: int
+    name: str
+    is_relayed: bool
+
+
+class FrameReader:
+    """Finds the frames in bytes that arrive in pieces of any size; it stores less than one frame.
+
+    Attributes:
+        counts: ``frames``, ``bad_sums``, ``noise`` (bytes).
+    """
+
+    def __init__(self, *, is_escaped: bool) -> None:
+        self._is_escaped = is_escaped
+        self._buffer = bytearray()
+        self._flips_next = False
+        self.counts: Counter[str] = Counter()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The data of each frame that is complete now."""
+        frames: list[bytes] = []
+        for byte in data:
+            if self._is_escaped and byte == START:
+                self._drop(len(self._buffer))
+                self._flips_next = False
+            elif self._is_escaped and byte == ESCAPE:
+                self._flips_next = True
+                continue
+            elif self._flips_next:
+                byte ^= FLIP  # noqa: PLW2901 - the byte that was sent
+                self._flips_next = False
+            self._buffer.append(byte)
+            frames += self._complete()
+        return frames
+
+    def give_up(self) -> list[bytes]:
+        """A frame that is not complete now will not be: its length was damaged. Search its bytes for others."""
+        if self._buffer:
+            self._drop_frame()
+        return self._complete()
+
+    def _complete(self) -> list[bytes]:
+        buffer, frames = self._buffer, list[bytes]()
+        while buffer:
+            if buffer[0] != START:
+                self._drop(1)
+                continue
+            if len(buffer) < 3:
+                break
+            size = buffer[1] << 8 | buffer[2]
+            if not 0 < size <= LONGEST:
+                self._drop_frame()
+                continue
+            if len(buffer) < size + 4:
+                break
+            if sum(buffer[3 : size + 4]) & 0xFF != 0xFF:
+                self.counts["bad_sums"] += 1
+                self._drop_frame()
+                continue
+            frames.append(bytes(buffer[3 : size + 3]))
+            self.counts["frames"] += 1
+            del buffer[: size + 4]
+        return frames
+
+    def _drop_frame(self) -> None:
+        """Without escapes the next frame may begin within this one."""
+        self._drop(len(self._buffer) if self._is_escaped else 1)
+
+    def _drop(self, count: int) -> None:
+        self.counts["noise"] += count
+        del self._buffer[:count]
+
+
+def format_frame(data: bytes, *, is_escaped: bool) -> bytes:
+    """A frame as bytes."""
+    body = len(data).to_bytes(2) + data + bytes([0xFF - (sum(data) & 0xFF)])
+    if is_escaped:
+        body = b"".join(bytes([ESCAPE, byte ^ FLIP]) if byte in ESCAPED else bytes([byte]) for byte in body)
+    return bytes([START]) + body
+
+
+def format_at(frame_id: int, command: bytes, value: bytes = b"") -> bytes:
+    """Data of a command for the own module."""
+    return bytes([AT, frame_id]) + command + value
+
+
+def format_remote_at(frame_id: int, address: int, command: bytes) -> bytes:
+    """Data of a command for another module, given by its serial number; its network address need not be known."""
+    return bytes([REMOTE_AT, frame_id]) + address.to_bytes(8) + b"\xff\xfe\x00" + command
+
+
+def parse_frame(data: bytes) -> Message:
+    """What a frame says; one that is too short for its type is ``OtherFrame``."""
+    kind = data[0]
+    if kind == AT_RESPONSE and len(data) >= 5:
+        return AtResponse(data[1], data[2:4], data[4], data[5:])
+    if kind == REMOTE_RESPONSE and len(data) >= 15:
+        return RemoteResponse(data[1], int.from_bytes(data[2:10]), data[12:14], data[14], data[15:])
+    if kind == MODEM_STATUS and len(data) >= 2:
+        return ModemStatus(data[1])
+    if kind == ROUTE_RECORD and len(data) >= 13 and len(data) == 13 + 2 * data[12]:
+        return RouteRecord(int.from_bytes(data[1:9]), data[12])
+    return OtherFrame(kind)
+
+
+def parse_node(data: bytes) -> Node | None:
+    """One answer to the node discovery ``ND``; None for its end and for what is no such answer.
+
+    Zigbee: network address (2), serial number (8), name, zero, parent (2), type, status, profile (2), maker (2), and
+    what ``NO`` adds. 802.15.4: network address (2), serial number (8), level, name, zero.
+    """
+    if len(data) < 12:
+        return None
+    address = int.from_bytes(data[2:10])
+    name, zero, rest = data[10:].partition(b"\0")
+    if not zero:
+        return None
+    if not rest:  # 802.15.4, where all modules hear each other directly
+        name, is_relayed = name[1:], False
+    elif len(rest) >= 8:
+        is_relayed = rest[2] == _END_DEVICE and int.from_bytes(rest[:2]) not in _COORDINATORS
+    else:
+        return None
+    text = name.decode("ascii", "replace").strip()
+    return Node(address, text or f"{address:016X}", is_relayed)

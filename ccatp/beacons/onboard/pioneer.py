@@ -1,0 +1,224 @@
+"""The Pioneer base: handshake, speeds, odometry, sonars, battery, stall, bumpers, and its own watchdog.
+
+The base stops its wheels when it has received no command for the time of its watchdog, which is a parameter in its
+flash memory: the program reads it and refuses a base that waits longer than the configuration allows. Speeds are sent
+as travel (mm/s) and turn (degrees/s), which are finer than ``VEL2`` (20 mm/s); what rounding leaves over is added to
+the next command.
+"""
+
+from math import inf, pi
+
+from ccatp.beacons.config.onboard_models import BaseDeviceConfig
+from ccatp.beacons.links.arcos_packets import (
+    CLOSE,
+    CONFIG,
+    ENABLE,
+    ENCODER,
+    OPEN,
+    RVEL,
+    SETA,
+    SETRA,
+    SONAR,
+    STANDARD_PACKETS,
+    SYNC0,
+    SYNC2,
+    VEL,
+    PacketReader,
+    Standard,
+    format_command,
+    parse_config,
+    parse_encoders,
+    parse_names,
+    parse_standard,
+)
+from ccatp.beacons.onboard.serial_device import SerialDevice
+from ccatp.onboard.devices.serial_line import OpenPort
+from ccatp.onboard.hardware import HardwareError
+
+ASK_S = 0.25  # between two packets of the handshake
+CLOSED_S = 1.0  # that the base needs after the end of a session
+_CONFIGURES, _RUNS = SYNC2 + 1, SYNC2 + 2  # stages after those of the handshake
+_DEGREE_RAD = pi / 180.0
+SEND_S = 0.05  # between two commands with the same set points
+_ENABLE_S = 1.0  # in which the base enables its motors
+_DISAGREES = 0.5  # of the base's own speed, by which the encoders may differ from it
+_FAST_MM_S = 60.0  # speeds above are compared
+_CONTINUOUS = 2
+
+WheelSpeeds = tuple[float, float | None, float | None]  # time; mean speed of the right and left wheel since the last
+
+
+class PioneerBase(SerialDevice):
+    """The base.
+
+    Attributes:
+        watchdog_s: its own; None before it was read.
+        stall: reason while a wheel is stalled or a bumper pressed; empty otherwise.
+        soc: state of charge, 0 to 1.
+        reader: of the received bytes.
+    """
+
+    title, key = "base", "devices.base"
+
+    def __init__(self, config: BaseDeviceConfig, body: tuple[float, float], open_port: OpenPort) -> None:
+        super().__init__(config.device, config.baud, open_port)
+        self._config = config
+        self._radius_m, self._track_m = body
+        self.reader = PacketReader()
+        self._stage = SYNC0
+        self._ask_s = self._enable_s = self._standard_s = self._counts_s = -inf
+        self._last: tuple[int, int] | None = None
+        self._samples: list[WheelSpeeds] = []
+        self._rates = 0.0, 0.0  # newest, right and left
+        self._rest = [0.0, 0.0]
+        self._set_points, self._sent_s = (0.0, 0.0), -inf
+        self._ranges: dict[int, tuple[float, float]] = {}  # time, m
+        self._doubts = 0
+        self.watchdog_s: float | None = None
+        self.stall = ""
+        self.soc = 1.0
+
+    @property
+    def is_ready(self) -> bool:
+        """It sends its packets, and its watchdog is short enough."""
+        return self._line.is_open and self._stage == _RUNS and self._counts_s > -inf and self._standard_s > -inf
+
+    # -- in time ------------------------------------------------------------------------------------------------------
+
+    def _begin(self, now_s: float) -> None:
+        self.reader = PacketReader()
+        self._restart(now_s)
+
+    def _restart(self, now_s: float) -> None:
+        self._stage, self._ask_s, self._last = SYNC0, now_s, None
+        self._standard_s = self._counts_s = -inf
+        self._ranges = {}
+        self.watchdog_s = None
+
+    def _stop(self) -> None:
+        stage, self._stage = self._stage, SYNC0
+        if self._line.is_open and stage == _RUNS:
+            self._line.write(format_command(VEL, 0) + format_command(RVEL, 0) + format_command(CLOSE))
+
+    def _receive(self, data: bytes, now_s: float) -> None:
+        for packet in self.reader.feed(data):
+            self._line.accept(now_s)
+            self._take_packet(packet, now_s)
+        if self._stage < _RUNS and now_s >= self._ask_s:
+            self._ask_s = now_s + ASK_S
+            self._line.write(format_command(self._stage) if self._stage <= SYNC2 else format_command(CONFIG))
+        elif self._stage == _RUNS and now_s - self._line.valid_s > CLOSED_S:
+            self._restart(now_s)  # it was switched off, or restarted
+
+    def _take_packet(self, packet: bytes, now_s: float) -> None:
+        kind, config = packet[0], self._config
+        if self._stage <= SYNC2:
+            if kind in STANDARD_PACKETS:  # the session of a program that died is still open
+                self._line.write(format_command(CLOSE))
+                self._stage, self._ask_s = SYNC0, now_s + CLOSED_S
+            elif kind == self._stage:
+                if kind == SYNC2:
+                    name, base, model = parse_names(packet)
+                    self.identity = f"{base} {model} {name}".strip()
+                    self._line.write(format_command(OPEN))
+                self._stage += 1
+                self._ask_s = now_s
+        elif self._stage == _CONFIGURES and (found := parse_config(packet)) is not None:
+            self.watchdog_s = 1e-3 * found.watchdog_ms
+            if not 0.0 < self.watchdog_s <= config.most_watchdog_s:
+                raise HardwareError(
+                    f"{self.identity}: its watchdog is {self.watchdog_s:g} s; set WatchDog of the base to at most "
+                    f"{1e3 * config.most_watchdog_s:.0f} ms"
+                )
+            acceleration = round(1e3 * config.acceleration_m_s2)
+            turn = round(config.turn_acceleration_rad_s2 / _DEGREE_RAD)
+            for command, value in (
+                (SETA, acceleration), (SETA, -acceleration), (SETRA, turn), (SETRA, -turn),
+                (SONAR, 1), (ENCODER, _CONTINUOUS), (ENABLE, 1),
+            ):  # fmt: skip
+                self._line.write(format_command(command, value))
+            self._stage, self._enable_s = _RUNS, now_s + _ENABLE_S
+        elif (standard := parse_standard(packet)) is not None:
+            self._take_standard(standard, now_s)
+        elif (counts := parse_encoders(packet)) is not None:
+            self._take_counts(counts, now_s)
+
+    def _take_standard(self, standard: Standard, now_s: float) -> None:
+        config = self._config
+        self._standard_s = now_s
+        for number, range_mm in standard.sonars:
+            self._ranges[number] = now_s, 1e-3 * range_mm
+        span_v = config.battery_full_v - config.battery_empty_v
+        self.soc = min(1.0, max(0.0, (standard.battery_v - config.battery_empty_v) / span_v))
+        stalled = [side for side, is_stalled in zip(("left", "right"), standard.stalls, strict=True) if is_stalled]
+        pressed = [side for side, bits in zip(("front", "rear"), standard.bumpers, strict=True) if bits]
+        self.stall = f"{stalled[0]} wheel stalled" if stalled else f"{pressed[0]} bumper pressed" if pressed else ""
+        if not standard.is_enabled and now_s >= self._enable_s:
+            # An operator has pressed STOP: only an operator switches the motors on again.
+            self.stall = "its motors are off; press MOTORS on the base"
+        self._compare(standard)
+
+    def _compare(self, standard: Standard) -> None:
+        """Count how often the encoders contradict the base's own speeds: a wrong sign or scale."""
+        for rate, own_mm_s in zip(self._rates, (standard.right_mm_s, standard.left_mm_s), strict=True):
+            if abs(own_mm_s) > _FAST_MM_S:
+                is_off = abs(1e3 * self._radius_m * rate - own_mm_s) > _DISAGREES * abs(own_mm_s)
+                self._doubts = min(self._doubts + 1, 40) if is_off else 0
+
+    def _take_counts(self, counts: tuple[int, int], now_s: float) -> None:
+        last, last_s = self._last, self._counts_s
+        self._last, self._counts_s = counts, now_s
+        self._line.recover()
+        if last is None or now_s - last_s > self._config.timeout_s or now_s <= last_s:
+            return  # a gap: the speeds within it are not known
+        per_rad = 1e3 * self._radius_m * self._config.counts_per_mm
+        left, right = (
+            ((now - before + 0x80000000) & 0xFFFFFFFF) - 0x80000000 for now, before in zip(counts, last, strict=True)
+        )
+        self._rates = right / per_rad / (now_s - last_s), left / per_rad / (now_s - last_s)
+        self._samples.append((now_s, *self._rates))
+
+    # -- the robot ----------------------------------------------------------------------------------------------------
+
+    def take(self) -> list[WheelSpeeds]:
+        """Speeds of the wheels since the last call, oldest first."""
+        samples, self._samples = self._samples, []
+        return samples
+
+    def drive(self, right_rad_s: float, left_rad_s: float, now_s: float) -> None:
+        """Set the speeds of the wheels; each command also restarts the base's watchdog. Raises HardwareError."""
+        set_points = right_rad_s, left_rad_s
+        if self._stage != _RUNS or (set_points == self._set_points and now_s - self._sent_s < SEND_S):
+            return
+        self._set_points, self._sent_s = set_points, now_s
+        wanted = (
+            500.0 * self._radius_m * (right_rad_s + left_rad_s),
+            self._radius_m * (right_rad_s - left_rad_s) / self._track_m / _DEGREE_RAD,
+        )
+        if not any(set_points):
+            self._rest = [0.0, 0.0]
+        sent = [round(value + rest) for value, rest in zip(wanted, self._rest, strict=True)]
+        self._rest = [value + rest - whole for value, rest, whole in zip(wanted, self._rest, sent, strict=True)]
+        try:
+            self._line.write(format_command(VEL, sent[0]) + format_command(RVEL, sent[1]))
+        except OSError as error:
+            raise HardwareError(f"base: {error}") from None
+
+    def distances_m(self, now_s: float) -> list[float] | None:
+        """Readings of the sonars of the configuration, in its order; None while one of them is missing."""
+        config, found = self._config, list[float]()
+        for number in config.sonars:
+            read_s, range_m = self._ranges.get(number, (-inf, 0.0))
+            if now_s - read_s > config.sonar_timeout_s:
+                return None
+            found.append(min(range_m, config.sonar_max_m))
+        return found
+
+    def fault(self, now_s: float) -> str:
+        """The reason why the wheels cannot be measured or driven; empty if they can."""
+        age_s = now_s - max(min(self._counts_s, self._standard_s), -1e6)
+        if self._stage != _RUNS or age_s > self._config.timeout_s:
+            return f"no packet for {age_s:.2f} s: {self.why()}" if self._counts_s > -inf else self.why()
+        if self._doubts >= 10:
+            return "the encoders contradict the speeds of the base; correct devices.base.counts_per_mm"
+        return ""

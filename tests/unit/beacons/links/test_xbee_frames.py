@@ -1,0 +1,131 @@
+"""Frames of XBee modules against frames that others published, and lines that are damaged."""
+
+import random
+
+import pytest
+
+from ccatp.beacons.links.xbee_frames import (
+    AtResponse,
+    FrameReader,
+    ModemStatus,
+    Node,
+    OtherFrame,
+    RemoteResponse,
+    RouteRecord,
+    format_at,
+    format_frame,
+    format_remote_at,
+    parse_frame,
+    parse_node,
+)
+
+BEACON = 0x0013A20040522BAA
+# Frames as they are printed in Digi's manuals (S2C Zigbee, S2C 802.15.4, XBee 3 Zigbee) or in public notes about them.
+PUBLISHED = {
+    "S2C, escaping of data": ("7E 00 02 23 11 CB", OtherFrame(0x23)),
+    "notes on API frames, coordinator started": ("7E 00 02 8A 06 6F", ModemStatus(6)),
+    "notes on API frames, answer to MY": ("7E 00 07 88 52 4D 59 00 00 00 7F", AtResponse(0x52, b"MY", 0, b"\0\0")),
+    "S2C, answer to BD": ("7E 00 05 88 01 42 44 00 F0", AtResponse(1, b"BD", 0, b"")),
+    "S2C, transmit status": ("7E 00 07 8B 01 7D 84 00 00 01 71", OtherFrame(0x8B)),
+    "S2C, explicit receive": (
+        "7E 00 18 91 00 13 A2 00 40 52 2B AA 7D 84 E0 E0 22 11 C1 05 02 52 78 44 61 74 61 52", OtherFrame(0x91),
+    ),
+    "S2C, remote answer to SL": (
+        "7E 00 13 97 55 00 13 A2 00 40 52 2B AA 7D 84 53 4C 00 40 52 2B AA F0",
+        RemoteResponse(0x55, BEACON, b"SL", 0, bytes.fromhex("40522BAA")),
+    ),
+    "S2C, route record with three relays": (
+        "7E 00 13 A1 00 13 A2 00 40 40 11 22 33 44 01 03 EE FF CC DD AA BB 80", RouteRecord(0x0013A20040401122, 3),
+    ),
+    "S2C, node identification": (
+        "7E 00 20 95 00 13 A2 00 40 52 2B AA 7D 84 02 7D 84 00 13 A2 00 40 52 2B AA 20 00 FF FE 01 01 C1 05 10 1E 1B",
+        OtherFrame(0x95),
+    ),
+    "S2C 802.15.4, transmit status": ("7E 00 03 89 01 00 75", OtherFrame(0x89)),
+    "S2C, transmit of Hello": ("7E 00 0A 01 01 50 01 00 48 65 6C 6C 6F B8", OtherFrame(0x01)),
+    "XBee 3, command BD 1200": ("7E 00 06 08 01 42 44 04 B0 BC", OtherFrame(0x08)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("printed", "meaning"), PUBLISHED.values(), ids=PUBLISHED)
+@pytest.mark.parametrize("is_escaped", [False, True])
+def test_published_frames_are_read_and_written(printed: str, meaning: object, is_escaped: bool) -> None:
+    frame = bytes.fromhex(printed)
+    sent = format_frame(frame[3:-1], is_escaped=is_escaped)
+    assert is_escaped or sent == frame
+    reader = FrameReader(is_escaped=is_escaped)
+    (found,) = [data for byte in sent for data in reader.feed(bytes([byte]))]
+    assert parse_frame(found) == meaning
+    assert reader.counts["noise"] == 0
+
+
+def test_escapes_are_those_of_the_manual() -> None:
+    assert format_frame(b"\x23\x11", is_escaped=True) == bytes.fromhex("7E 00 02 23 7D 31 CB")
+
+
+def test_commands_are_those_of_the_manual() -> None:
+    assert format_frame(format_at(0x52, b"MY"), is_escaped=False) == bytes.fromhex("7E 00 04 08 52 4D 59 FF")
+    # The manual's example sets BH of another module; its data and its option "apply changes" differ.
+    frame = format_remote_at(1, 0x0013A20040401122, b"BH")
+    assert frame == bytes.fromhex("17 01 00 13 A2 00 40 40 11 22 FF FE 00 42 48")
+
+
+# Without escapes a frame whose last byte is 7E and gets lost borrows its end from the next frame: no level is 7E.
+FRAME = format_frame(b"\x88\x01DB\x00\x28", is_escaped=False)
+ESCAPED = format_frame(b"\x88\x7eDB\x00\x7e", is_escaped=True)
+
+
+@pytest.mark.parametrize("frame", [FRAME, ESCAPED], ids=["API 1", "API 2"])
+def test_a_byte_lost_at_any_position_costs_at_most_the_frame_and_the_next(frame: bytes) -> None:
+    for k in range(len(frame)):
+        reader = FrameReader(is_escaped=frame is ESCAPED)
+        found = reader.feed(frame + frame[:k] + frame[k + 1 :] + 3 * frame) + reader.give_up()
+        assert 3 <= len(found) <= 4
+        assert set(found) == {b"\x88\x01DB\x00\x28" if frame is FRAME else b"\x88\x7eDB\x00\x7e"}
+        assert reader.counts["noise"] or len(found) == 4
+
+
+@pytest.mark.parametrize("is_escaped", [False, True])
+def test_wrong_sums_noise_and_impossible_lengths_hold_nothing_up(is_escaped: bool) -> None:
+    frame = format_frame(b"\x8a\x06", is_escaped=is_escaped)
+    reader = FrameReader(is_escaped=is_escaped)
+    wrong = frame[:-1] + bytes([frame[-1] ^ 1])
+    found = reader.feed(b"\x00\x7e\xff\xff" + frame + wrong + frame + b"\x7e\x00\x00" + frame)
+    assert [parse_frame(data) for data in found] == 3 * [ModemStatus(6)]
+    assert reader.counts["bad_sums"] >= 1
+
+
+def test_noise_is_bounded_and_hardly_ever_a_frame() -> None:
+    rng = random.Random(5)
+    for is_escaped in (False, True):
+        reader = FrameReader(is_escaped=is_escaped)
+        frames = reader.feed(rng.randbytes(50_000))
+        kept = 50_000 - reader.counts["noise"] - sum(len(frame) + 4 for frame in frames)
+        assert kept <= 304 or is_escaped  # escapes are removed before the count
+        assert len(frames) < 50  # one start in 256, one sum in 256
+
+
+@pytest.mark.parametrize("data", [b"\x88", b"\x97\x01", b"\xa1" + bytes(12) + b"\x03", b"\x8a", b"\x88\x01DB"])
+def test_a_frame_too_short_for_its_type_says_nothing(data: bytes) -> None:
+    assert parse_frame(data) == OtherFrame(data[0])
+
+
+ZIGBEE = bytes.fromhex("1234 0013A20040522BAA") + b"beacon1\x00"
+
+
+@pytest.mark.parametrize(
+    ("data", "node"),
+    [
+        (ZIGBEE + bytes.fromhex("FFFE 01 00 C105 101E"), Node(BEACON, "beacon1", False)),
+        (ZIGBEE + bytes.fromhex("0000 02 00 C105 101E"), Node(BEACON, "beacon1", False)),  # child of the coordinator
+        (ZIGBEE + bytes.fromhex("4F21 02 00 C105 101E"), Node(BEACON, "beacon1", True)),  # child of a router
+        (ZIGBEE + bytes.fromhex("FFFE 01 00 C105 101E 00030000 2A"), Node(BEACON, "beacon1", False)),  # with NO
+        (bytes.fromhex("1234 0013A20040522BAA 2A") + b"beacon1\x00", Node(BEACON, "beacon1", False)),  # 802.15.4
+        (bytes.fromhex("1234 0013A20040522BAA 2A") + b" \x00", Node(BEACON, "0013A20040522BAA", False)),
+        (b"", None),
+        (ZIGBEE + b"\xff\xfe\x01", None),
+        (ZIGBEE[:-1], None),
+    ],
+)
+def test_answers_to_the_discovery(data: bytes, node: Node | None) -> None:
+    assert parse_node(data) == node

@@ -1,0 +1,239 @@
+"""The Pioneer base: handshake, speeds, odometry, sonars, its watchdog, and what breaks."""
+
+import itertools
+from collections.abc import Callable
+from math import inf, radians
+
+import pytest
+
+from ccatp.beacons.config.onboard_load import load_beacon_onboard_config
+from ccatp.beacons.onboard.pioneer import PioneerBase
+from ccatp.onboard.hardware import HardwareError
+from tests.support.beacon_fakes import FakePioneer, FakePort, FakeXBee
+from tests.support.onboard_fakes import FakeTime
+
+RADIUS_M, TRACK_M = 0.0975, 0.33
+
+
+class Rig:
+    """A base whose wheels follow at once, and its driver."""
+
+    def __init__(self, **settings: object) -> None:
+        overrides = {f"devices.base.{key}": value for key, value in settings.items()}
+        cfg = load_beacon_onboard_config(None, overrides).devices.base
+        self.time = FakeTime()
+        self.ranges_m = [0.5 + 0.1 * k for k in range(16)]
+        self.driven: list[tuple[float, float]] = []
+        self.device = FakePioneer(self.time, self._move, lambda: self.ranges_m, TRACK_M)
+        self.base = PioneerBase(cfg, (RADIUS_M, TRACK_M), lambda *_: self.device.open())
+        self.samples: list[tuple[float, float | None, float | None]] = []
+
+    def _move(self, velocity_m_s: float, turn_rad_s: float) -> tuple[float, float]:
+        self.driven.append((velocity_m_s, turn_rad_s))
+        return velocity_m_s, turn_rad_s
+
+    def open(self) -> "Rig":
+        self.base.open(self.time, self.time.sleep, 8.0)
+        return self
+
+    def run(self, duration_s: float, right: float | None = None, left: float = 0.0) -> None:
+        end_s = self.time.now_s + duration_s
+        while self.time.now_s < end_s:
+            self.time.sleep(0.01)
+            self.base.poll(self.time.now_s)
+            self.samples += self.base.take()
+            if right is not None:
+                self.base.drive(right, left, self.time.now_s)
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig().open()
+
+
+def test_the_handshake_and_what_the_base_says_of_itself(rig: Rig) -> None:
+    assert rig.base.identity == "Pioneer p3dx-sh Bradley_1"
+    assert rig.base.watchdog_s == 0.5
+    assert rig.base.soc == pytest.approx((12.5 - 11.0) / 1.7, abs=0.01)
+    assert rig.device.is_enabled
+    rig.run(0.2)
+    assert not rig.base.fault(rig.time.now_s)
+
+
+@pytest.mark.parametrize(("right", "left"), [(2.0, 2.0), (-1.0, -1.0), (1.0, -1.0), (1.503, 0.4071), (0.11, 0.13)])
+def test_wheels_turn_as_commanded_in_the_mean_and_encoders_show_it(rig: Rig, right: float, left: float) -> None:
+    rig.run(0.3, right, left)
+    rig.samples.clear()
+    first = len(rig.driven)
+    rig.run(20.0, right, left)
+    velocity = sum(v for v, _ in rig.driven[first:]) / len(rig.driven[first:])
+    turn = sum(w for _, w in rig.driven[first:]) / len(rig.driven[first:])
+    # Rounded to 1 mm/s and 1 degree/s, the rest is carried over. The fake base takes every second command.
+    assert velocity == pytest.approx(0.5 * RADIUS_M * (right + left), abs=0.51e-3)
+    assert turn == pytest.approx(RADIUS_M * (right - left) / TRACK_M, abs=radians(0.51))
+    rights, lefts = ([sample[side] or 0.0 for sample in rig.samples] for side in (1, 2))
+    assert sum(rights) / len(rights) == pytest.approx(right, abs=0.01)
+    assert sum(lefts) / len(lefts) == pytest.approx(left, abs=0.01)
+    assert not rig.base.fault(rig.time.now_s)
+
+
+def test_counts_wrap(rig: Rig) -> None:
+    rig.device.counts = [2.0**31 - 2000, -(2.0**31) + 2000]
+    rig.run(0.25, 0.0)
+    rig.samples.clear()
+    rig.run(3.0, 1.0, -1.0)
+    assert all(abs(sample[side] or 0.0) < 1.2 for sample in rig.samples for side in (1, 2))
+
+
+def test_zero_is_sent_at_once_and_nothing_is_carried_over(rig: Rig) -> None:
+    rig.run(1.0, 1.003, 0.4)
+    rig.base.drive(0.0, 0.0, rig.time.now_s)
+    assert (rig.device.velocity, rig.device.turn) == (0.0, 0.0)
+
+
+def test_the_line_is_not_flooded(rig: Rig) -> None:
+    written: list[bytes] = []
+    rig.device.take = written.append  # type: ignore[assignment, method-assign]
+    rig.run(1.0, 1.0, 0.5)
+    assert 15 <= len(written) <= 21  # each 0.05 s; at 9600 baud a command of 18 bytes takes 19 ms
+
+
+def test_the_watchdog_of_the_base_is_the_second_barrier(rig: Rig) -> None:
+    rig.run(1.0, 2.0, 2.0)
+    moving_s = rig.time.now_s
+    while rig.device.velocity:  # nothing is sent any more, as after the end of the program
+        rig.time.sleep(0.01)
+        rig.device.live()
+        assert rig.time.now_s - moving_s < 1.0
+    assert rig.device.expired == 1
+    assert rig.time.now_s - moving_s <= 0.5 + 0.1 + 0.05  # watchdog, a cycle, the last command's age
+
+
+def test_a_base_that_waits_too_long_is_refused() -> None:
+    rig = Rig()
+    rig.device.watchdog_ms = 2000
+    with pytest.raises(HardwareError, match=r"its watchdog is 2 s; set WatchDog of the base to at most 500 ms$"):
+        rig.open()
+
+
+def test_sonars_in_the_order_of_the_configuration(rig: Rig) -> None:
+    rig.run(0.3)
+    assert rig.base.distances_m(rig.time.now_s) == pytest.approx([0.5 + 0.1 * k for k in (7, 6, 5, 4, 3, 2, 1, 0)])
+    rig.ranges_m[3] = 9.0
+    rig.run(0.3)
+    found = rig.base.distances_m(rig.time.now_s)
+    assert found is not None
+    assert found[4] == 5.0  # without an echo
+    rig.device.numbers = [0, 1, 2]
+    rig.run(1.5)
+    assert rig.base.distances_m(rig.time.now_s) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"stalls": [True, False]}, "left wheel stalled"),
+        ({"stalls": [False, True]}, "right wheel stalled"),
+        ({"bumpers": [4, 0]}, "front bumper pressed"),
+        ({"bumpers": [0, 1]}, "rear bumper pressed"),
+        ({"stop_pressed": True}, "its motors are off; press MOTORS on the base"),
+    ],
+)
+def test_stalls_bumpers_and_the_stop_button(rig: Rig, change: dict[str, object], reason: str) -> None:
+    rig.run(1.2)
+    assert not rig.base.stall
+    rig.device.__dict__.update(change)
+    rig.run(0.3)
+    assert rig.base.stall == reason
+    rig.device.__dict__.update(stalls=[False, False], bumpers=[0, 0], stop_pressed=False, is_enabled=True)
+    rig.run(0.3)
+    assert not rig.base.stall
+
+
+def test_the_motors_stay_off_after_the_stop_button(rig: Rig) -> None:
+    rig.device.stop_pressed = True
+    rig.run(5.0, 1.0, 1.0)
+    rig.device.stop_pressed = False
+    rig.run(5.0, 1.0, 1.0)
+    assert not rig.device.is_enabled
+
+
+def test_the_session_of_a_program_that_died_is_closed_first() -> None:
+    rig = Rig().open()
+    rig.run(0.5, 1.0, 1.0)
+    cfg = load_beacon_onboard_config().devices.base
+    rig.base = PioneerBase(cfg, (RADIUS_M, TRACK_M), lambda *_: rig.device.open())
+    rig.open()
+    assert rig.device.velocity == 0.0
+    rig.run(0.3)
+    assert not rig.base.fault(rig.time.now_s)
+
+
+def test_a_base_that_is_switched_off_and_on(rig: Rig) -> None:
+    rig.run(1.0, 1.0, 1.0)
+    rig.device.is_mute = True
+    rig.run(0.5)
+    assert "no packet for" in rig.base.fault(rig.time.now_s)
+    rig.device.is_mute = False
+    rig.device.power_on()
+    rig.samples.clear()
+    rig.run(4.0)
+    assert not rig.base.fault(rig.time.now_s)
+    assert all(abs(sample[1] or 0.0) < 0.1 for sample in rig.samples)  # the counts began again at zero
+
+
+def test_any_byte_of_a_packet_may_get_lost(rig: Rig) -> None:
+    for k in range(60):
+        packets = itertools.count()
+        rig.device.corrupt = (
+            lambda data, k=k, packets=packets: (  # type: ignore[misc]
+                data[:k] + data[k + 1 :] if next(packets) % 5 == 0 else data
+            )
+        )
+        rig.samples.clear()
+        rig.run(1.0, 1.0, 1.0)
+        assert all(0.5 < (sample[1] or 0.0) < 1.5 for sample in rig.samples), k
+        assert len(rig.samples) >= 4
+
+
+def test_encoders_that_contradict_the_base_are_a_fault() -> None:
+    rig = Rig(counts_per_mm=12.8).open()
+    rig.run(3.0, 2.0, 2.0)
+    assert "contradict the speeds of the base; correct devices.base.counts_per_mm" in rig.base.fault(rig.time.now_s)
+
+
+def _set(**values: object) -> Callable[[Rig], FakePort]:
+    def change(rig: Rig) -> FakePort:
+        rig.device.__dict__.update(values)
+        return rig.device
+
+    return change
+
+
+def _xbee(rig: Rig) -> FakePort:
+    return FakeXBee(rig.time, ["beacon1"], lambda _: -40.0)
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (_set(is_mute=True), "^base: it does not answer; check its supply, devices.base.device and devices.base.baud$"),
+        (_set(corrupt=lambda data: bytes(200)), "^base: garbage at 9600 baud; check devices.base.baud$"),
+        (_xbee, "^base: an XBee answers on its port; exchange the ports, or correct devices.base.device$"),
+        (_set(open_error=HardwareError("/dev/ttyUSB0: permission denied")), "^base: /dev/ttyUSB0: permission denied$"),
+    ],
+)
+def test_what_is_wrong_with_the_port(other: Callable[[Rig], FakePort], message: str) -> None:
+    rig = Rig()
+    device = other(rig)
+    rig.base._line._open_port = lambda *_: device.open()
+    with pytest.raises(HardwareError, match=message):
+        rig.open()
+
+
+def test_closing_stops_the_wheels_and_ends_the_session(rig: Rig) -> None:
+    rig.run(0.5, 1.0, 1.0)
+    rig.base.close()
+    assert (rig.device.velocity, rig.device.is_enabled) == (0.0, True)
+    assert rig.device.closed == 1
+    assert rig.base.distances_m(inf) is None
