@@ -33,7 +33,7 @@ def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: 
     """
     from ccatp.config.load import load_config
     from ccatp.mirror.mirror import build_mirror
-    from ccatp.survey.composition import make_plan, plan_data, plan_lines
+    from ccatp.survey.survey_plan import make_plan, plan_data, plan_lines
 
     cfg = load_config(config_file, settings)
     geometry = build_mirror(cfg.mirror)

@@ -22,7 +22,7 @@ from ccatp.report import plots
 from ccatp.report.findings import Grade, PointVerdict, point_verdicts
 from ccatp.report.plots import BAD, INK, PANEL, PAPER, PATH, PX_PER_IN, QUIET, SEAM, PictureError, add_legend, is_wide
 from ccatp.report.record import WITHIN_MM, RunRecord, read_record
-from ccatp.survey.composition import SurveyPlan
+from ccatp.survey.survey_plan import SurveyPlan
 
 MAP_WIDTH_PX, MAP_DPI = 1600, 160
 ALIGN_WIDTH_PX, ALIGN_DPI = 2400, 200

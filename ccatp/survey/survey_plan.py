@@ -1,0 +1,141 @@
+"""The plan of a survey before it begins, as text and data."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import accumulate, groupby
+from typing import Any
+
+from ccatp.config.models import Config
+from ccatp.control.grip_model import GripForecast, GripModel
+from ccatp.core import PointId, Stop, StopKind
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.composition import plan_survey, slowed
+from ccatp.survey.planning.route import ORDERS
+from ccatp.survey.planning.search import leg_lengths, leg_time, stop_times
+from ccatp.survey.planning.tour_bound import tour_bound
+
+_SHOWN = 10
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyPlan:
+    """The plan of a survey: points in the order of measuring, with those out of reach, and stops.
+
+    ``times_s``: arrival at each stop, from the start. Driving, turning and measuring are least times, rest to rest;
+    their sum is the lower bound of the survey's time.
+    """
+
+    points: tuple[PointId, ...]
+    out_of_reach: tuple[PointId, ...]
+    stops: tuple[Stop, ...]
+    times_s: tuple[float, ...]
+    length_m: float
+    driving_s: float
+    turning_s: float
+    measuring_s: float
+    any_order_s: float
+    grip: GripForecast
+
+    @property
+    def least_s(self) -> float:
+        """Lower bound of the survey's time along this route."""
+        return self.driving_s + self.turning_s + self.measuring_s
+
+
+def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
+    """Plan a survey as a run would; raises ``PlanError`` if base is not on the mirror or is a dead end."""
+    grip = GripModel(cfg.robot).forecast(mirror)
+    cfg = slowed(cfg, grip)
+    points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+    out_of_reach: list[PointId] = []
+    stops = plan_survey(cfg, mirror, points, (), out_of_reach).stops
+    lengths_m, times_s = (
+        leg_lengths(stops, mirror.base_pose, mirror),
+        stop_times(stops, mirror.base_pose, cfg.limits, mirror),
+    )
+    driving_s = sum(leg_time(length, cfg.limits) for length in lengths_m)
+    rests_s = [cfg.etalon.measuring_time_s * stop.is_measured for stop in stops]
+    begins_s = accumulate((time_s + rest_s for time_s, rest_s in zip(times_s, rests_s, strict=True)), initial=0.0)
+    reached = [point for point in points if point not in set(out_of_reach)]
+    return SurveyPlan(
+        points=tuple(points),
+        out_of_reach=tuple(out_of_reach),
+        stops=stops,
+        times_s=tuple(begin_s + time_s for begin_s, time_s in zip(begins_s, times_s, strict=False)),
+        length_m=sum(lengths_m),
+        driving_s=driving_s,
+        turning_s=sum(times_s) - driving_s,
+        measuring_s=sum(rests_s),
+        any_order_s=tour_bound(mirror, reached, cfg.limits, cfg.etalon.measuring_time_s),
+        grip=grip,
+    )
+
+
+def plan_data(cfg: Config, plan: SurveyPlan) -> dict[str, Any]:
+    """The plan as data: lengths in m, times in s, points as [row, column, number]."""
+    kinds = [stop.kind for stop in plan.stops]
+    return {
+        "mirror": cfg.mirror.name,
+        "order": cfg.run.order,
+        "filter": cfg.run.filter,
+        "points": {"total": len(plan.points), "reached": len(plan.points) - len(plan.out_of_reach)},
+        "out_of_reach": [list(point) for point in plan.out_of_reach],
+        "length_m": round(plan.length_m, 3),
+        "lower_bound_s": round(plan.least_s, 3),
+        "driving_s": round(plan.driving_s, 3),
+        "turning_s": round(plan.turning_s, 3),
+        "measuring_s": round(plan.measuring_s, 3),
+        "any_order_bound_s": round(plan.any_order_s, 3),
+        "budget_s": cfg.run.budget_s,
+        "fits_budget": plan.least_s <= cfg.run.budget_s,
+        "thrust": {
+            "least_n": round(plan.grip.least_n, 2),
+            "needed_n": round(plan.grip.wanted_n, 2),
+            "available_n": plan.grip.thrust_n,
+            "safe_speed_m_s": round(plan.grip.safe_speed_m_s, 3),
+            "is_held": plan.grip.is_held,
+            "is_slow": plan.grip.is_short,
+        },
+        "via_stops": kinds.count(StopKind.VIA),
+        "stops": [
+            {
+                "t_s": round(time_s, 3),
+                "x_m": round(stop.x_m, 4),
+                "y_m": round(stop.y_m, 4),
+                "kind": stop.kind.value,
+                "point": None if stop.point is None else list(stop.point),
+                "reverse": stop.reverse,
+            }
+            for stop, time_s in zip(plan.stops, plan.times_s, strict=True)
+        ],
+    }
+
+
+def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
+    """The plan as lines for a terminal."""
+    vias = sum(stop.kind is StopKind.VIA for stop in plan.stops)
+    panels = [panel for panel, _ in groupby(point.panel for point in plan.points)]
+    limits = slowed(cfg, plan.grip).limits
+    count = len(set(panels))
+    of = f"{count} panel{'' if count == 1 else 's'}"
+    yield f"{cfg.mirror.name}: {len(plan.points)} points of {of}, order {cfg.run.order}"
+    first = " ".join(f"{panel.row}/{panel.col}" for panel in panels[:9])
+    yield f"first panels    {first}{' ...' if len(panels) > 9 else ''}"
+    yield f"way             {plan.length_m:.1f} m, {len(plan.stops)} stops, {vias} of them only on the way"
+    yield (
+        f"least time      {_clock(plan.least_s)}: {plan.driving_s:.0f} s driving, {plan.turning_s:.0f} s turning, "
+        f"{plan.measuring_s:.0f} s measuring"
+    )
+    at = f"at {limits.v_max_m_s:g} m/s and {limits.omega_max_rad_s:g} rad/s"
+    yield f"                {at}; simulated surveys take 1 to 10 % more"
+    yield f"any order       {_clock(plan.any_order_s)} at least, through the points that can be reached"
+    word = "within" if plan.least_s <= cfg.run.budget_s else "BEYOND"
+    yield f"budget          {_clock(cfg.run.budget_s)}: the least time is {word} it"
+    yield f"thrust          {plan.grip.text}"
+    lost = " ".join("/".join(map(str, point)) for point in plan.out_of_reach[:_SHOWN])
+    more = " ..." if len(plan.out_of_reach) > _SHOWN else ""
+    yield f"out of reach    {f'{len(plan.out_of_reach)} points: {lost}{more}' if lost else 'none'}"
+
+
+def _clock(time_s: float) -> str:
+    return f"{int(time_s) // 60} min {int(time_s) % 60:02d} s"
