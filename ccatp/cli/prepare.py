@@ -52,6 +52,8 @@ def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: 
         )
     if not found.grip.is_held:
         return common.complain(f"{found.grip.text}; a run would be refused", ExitStatus.USAGE)
+    if found.forecast.warning:
+        common.warn((found.forecast.warning,))
     return 0
 
 

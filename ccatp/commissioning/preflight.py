@@ -21,7 +21,10 @@ from ccatp.mirror.surface import ConvergenceError
 from ccatp.report.html import render
 from ccatp.rest import WHEEL_STANDS_RAD_S
 from ccatp.survey.checks import MirrorCheck
-from ccatp.survey.composition import robot_problems
+from ccatp.survey.composition import plan_survey, robot_problems
+from ccatp.survey.forecast import clock, forecast_time
+from ccatp.survey.planning.legs import PlanError
+from ccatp.survey.planning.route import ORDERS
 
 
 class CheckOutcome(StrEnum):
@@ -74,6 +77,18 @@ def lines(findings: Sequence[PreflightResult]) -> list[str]:
 def as_json(findings: Sequence[PreflightResult]) -> dict[str, Any]:
     """For ``--json``."""
     return {"ready": not has_failed(findings), "checks": [finding._asdict() for finding in findings]}
+
+
+def check_time(cfg: Config, mirror: Mirror) -> PreflightResult:
+    """Whether the survey is expected to keep its time budget."""
+    points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+    try:
+        forecast = forecast_time(cfg, mirror, plan_survey(cfg, mirror, points))
+    except PlanError as error:
+        return failed(str(error), "see ccatp plan")
+    if not forecast.is_within:
+        return warned(forecast.problem, forecast.advice)
+    return passed(f"{forecast.expectation}; run.budget_s is {clock(forecast.budget_s)}")
 
 
 LASER_NAMES = ("lasers", "air", "laser fix")

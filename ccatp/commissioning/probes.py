@@ -25,6 +25,7 @@ from ccatp.commissioning.preflight import (
     check_fix,
     check_lasers,
     check_robot,
+    check_time,
     failed,
     named,
     passed,
@@ -71,7 +72,11 @@ def probe_all(
     found = [
         *named(configuration=passed(f"{where}: mirror {mirror.name}, {len(mirror.panels)} panels")),
         *probe_machine(cfg, runs_dir, runtime_dir, os.environ),
-        *named(robot_key=probe_key(cfg, sim=sim), observatory_keys=_observatory(cfg)),
+        *named(
+            time_budget=check_time(cfg, mirror),
+            robot_key=probe_key(cfg, sim=sim),
+            observatory_keys=_observatory(cfg),
+        ),
     ]
 
     async def probe() -> list[PreflightResult]:

@@ -10,6 +10,7 @@ from ccatp.control.grip_model import GripForecast, GripModel
 from ccatp.core import PointId, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.composition import plan_survey, slowed
+from ccatp.survey.forecast import TimeForecast, clock, forecast_time
 from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.planning.search import leg_lengths, leg_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
@@ -34,6 +35,7 @@ class SurveyPlan:
     turning_s: float
     measuring_s: float
     any_order_s: float
+    forecast: TimeForecast
     grip: GripForecast
 
     @property
@@ -48,7 +50,8 @@ def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
     cfg = slowed(cfg, grip)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     out_of_reach: list[PointId] = []
-    stops = plan_survey(cfg, mirror, points, (), out_of_reach).stops
+    route = plan_survey(cfg, mirror, points, (), out_of_reach)
+    stops = route.stops
     lengths_m, times_s = (
         leg_lengths(stops, mirror.base_pose, mirror),
         stop_times(stops, mirror.base_pose, cfg.limits, mirror),
@@ -67,13 +70,14 @@ def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
         turning_s=sum(times_s) - driving_s,
         measuring_s=sum(rests_s),
         any_order_s=tour_bound(mirror, reached, cfg.limits, cfg.etalon.measuring_time_s),
+        forecast=forecast_time(cfg, mirror, route),
         grip=grip,
     )
 
 
 def plan_data(cfg: Config, plan: SurveyPlan) -> dict[str, Any]:
     """The plan as data: lengths in m, times in s, points as [row, column, number]."""
-    kinds = [stop.kind for stop in plan.stops]
+    kinds, forecast = [stop.kind for stop in plan.stops], plan.forecast
     return {
         "mirror": cfg.mirror.name,
         "order": cfg.run.order,
@@ -86,8 +90,12 @@ def plan_data(cfg: Config, plan: SurveyPlan) -> dict[str, Any]:
         "turning_s": round(plan.turning_s, 3),
         "measuring_s": round(plan.measuring_s, 3),
         "any_order_bound_s": round(plan.any_order_s, 3),
+        "expected_s": round(forecast.expected_s, 1),
+        "expected_slip": round(forecast.slip, 4),
         "budget_s": cfg.run.budget_s,
-        "fits_budget": plan.least_s <= cfg.run.budget_s,
+        "fits_budget": forecast.is_within,
+        "other_orders_s": {name: round(time_s, 1) for name, time_s in forecast.other_s.items()},
+        "order_within_budget": cfg.run.order if forecast.is_within else forecast.better,
         "thrust": {
             "least_n": round(plan.grip.least_n, 2),
             "needed_n": round(plan.grip.wanted_n, 2),
@@ -113,6 +121,7 @@ def plan_data(cfg: Config, plan: SurveyPlan) -> dict[str, Any]:
 
 def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
     """The plan as lines for a terminal."""
+    forecast = plan.forecast
     vias = sum(stop.kind is StopKind.VIA for stop in plan.stops)
     panels = [panel for panel, _ in groupby(point.panel for point in plan.points)]
     limits = slowed(cfg, plan.grip).limits
@@ -123,19 +132,15 @@ def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
     yield f"first panels    {first}{' ...' if len(panels) > 9 else ''}"
     yield f"way             {plan.length_m:.1f} m, {len(plan.stops)} stops, {vias} of them only on the way"
     yield (
-        f"least time      {_clock(plan.least_s)}: {plan.driving_s:.0f} s driving, {plan.turning_s:.0f} s turning, "
+        f"least time      {clock(plan.least_s)}: {plan.driving_s:.0f} s driving, {plan.turning_s:.0f} s turning, "
         f"{plan.measuring_s:.0f} s measuring"
     )
-    at = f"at {limits.v_max_m_s:g} m/s and {limits.omega_max_rad_s:g} rad/s"
-    yield f"                {at}; simulated surveys take 1 to 10 % more"
-    yield f"any order       {_clock(plan.any_order_s)} at least, through the points that can be reached"
-    word = "within" if plan.least_s <= cfg.run.budget_s else "BEYOND"
-    yield f"budget          {_clock(cfg.run.budget_s)}: the least time is {word} it"
+    yield f"                at {limits.v_max_m_s:g} m/s and {limits.omega_max_rad_s:g} rad/s"
+    yield f"expected        {clock(forecast.expected_s)}, with {forecast.slip:.1%} slip"
+    yield f"any order       {clock(plan.any_order_s)} at least, through the points that can be reached"
+    kept = "kept" if forecast.is_within else f"NOT kept; {forecast.advice}"
+    yield f"budget          {clock(forecast.budget_s)}: {kept}"
     yield f"thrust          {plan.grip.text}"
     lost = " ".join("/".join(map(str, point)) for point in plan.out_of_reach[:_SHOWN])
     more = " ..." if len(plan.out_of_reach) > _SHOWN else ""
     yield f"out of reach    {f'{len(plan.out_of_reach)} points: {lost}{more}' if lost else 'none'}"
-
-
-def _clock(time_s: float) -> str:
-    return f"{int(time_s) // 60} min {int(time_s) % 60:02d} s"

@@ -35,6 +35,7 @@ from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.composition import SurveyParts
 from ccatp.survey.events import Abort, Fault, Mode, SurveyOutcome, TrackingGap
 from ccatp.survey.fix_gate import FixGate
+from ccatp.survey.forecast import forecast_time
 from ccatp.survey.laser_follow import LaserFollow
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import by_reason
@@ -81,6 +82,8 @@ class SurveyRunner(MissionRunner):
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._state = Mode.IDLE
+        # Planned before the first frame: other orders take a second.
+        self._too_long = "" if parts.start else forecast_time(parts.cfg, parts.mirror, parts.route).warning
 
     @property
     def is_busy(self) -> bool:
@@ -171,6 +174,9 @@ class SurveyRunner(MissionRunner):
         self._checkpoint.boot = hello.boot
         # The robot's own floor applies where the mirror overhangs.
         self._fan_gate = FanGate(hello.robot.fan_floor if self._parts.mirror.overhang else 0.0)
+        if self._too_long:
+            self.telemetry.notify_operator("warning", self._too_long)
+            self._too_long = ""
 
     def begin_drives(self) -> None:
         duty = self._parts.thrust.duty

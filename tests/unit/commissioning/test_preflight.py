@@ -28,6 +28,7 @@ from ccatp.commissioning.preflight import (
     check_fix,
     check_lasers,
     check_robot,
+    check_time,
     failed,
     has_failed,
     lines,
@@ -368,3 +369,27 @@ def test_the_command_fails_where_one_fails(tmp_path: Path, free_port: int, capsy
     assert "--config FILE, or add --sim" in refused(capsys, "check")
     config.write_text("[observatory]\nendpoint = 'tcp://127.0.0.1:7020'\nkey_file = 'a'\nclients_file = 'b'\n")
     assert "fail  observatory keys" in printed(capsys, *command, status=1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "outcome", "todo"),
+    [
+        ({"run.panels": 2}, "pass", ""),
+        ({"run.panels": 8, "run.budget_s": 360.0}, "warn", 'run.order = "optimised" takes about '),
+        ({"run.panels": 8, "run.budget_s": 60.0}, "warn", "no order keeps it"),
+    ],
+)
+def test_a_survey_that_takes_longer_than_its_budget_is_reported(
+    settings: dict[str, object], outcome: str, todo: str
+) -> None:
+    cfg = load_config(None, settings)
+    found = check_time(cfg, build_mirror(cfg.mirror))
+    assert found.outcome == outcome
+    assert found.todo.startswith(todo)
+    assert ("more than run.budget_s" in found.found) == (outcome == "warn")
+
+
+def test_a_survey_without_a_way_fails_the_check() -> None:
+    cfg = load_config(None, {"run.panels": 1, "mission.leg_clearance_m": 0.12})
+    found = check_time(cfg, build_mirror(cfg.mirror))
+    assert (found.outcome, found.todo) == ("fail", "see ccatp plan")
