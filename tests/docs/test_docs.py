@@ -81,7 +81,10 @@ def test_a_page_of_measurements_begins_with_its_result(path: Path) -> None:
     assert result.count("\n") < LONGEST_RESULT
 
 
-@pytest.mark.parametrize("path", [path for path in SOURCES if blocks(path, "python")], ids=lambda path: path.stem)
+# tests/docs/test_notebook.py executes those of the page on analysis.
+@pytest.mark.parametrize(
+    "path", [path for path in SOURCES if blocks(path, "python") and path.stem != "python"], ids=lambda path: path.stem
+)
 def test_python_blocks_run(path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     names: dict[str, object] = {"__name__": "__docs__"}
     with patch.dict(FILTERS):  # a page may add one of its own
