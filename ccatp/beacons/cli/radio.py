@@ -26,7 +26,7 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 )
 @click.argument("path", type=common.PATH)
 @click.option(
-    "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv", "bag")),
+    "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv", "columns", "pyfg", "bag")),
     help="Format of the data; found out if not given.",
 )  # fmt: skip
 @click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
@@ -37,6 +37,9 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 )  # fmt: skip
 @common.CONFIG_OPTION
 @common.settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
+@click.option(
+    "--keep-heading", is_flag=True, help="Use a heading of the truth that is turned against its course as it is."
+)
 @click.option("--topics", "topics_file", type=common.PATH, help="Of a ROS bag: a TOML file that names its topics.")
 @common.figure_option("Draw map, path and residuals")
 @click.option(
@@ -49,13 +52,13 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 @common.JSON_OPTION
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
-    settings: Mapping[str, object], topics_file: Path | None, figure_file: Path | None, tum_file: Path | None,
-    peers: bool, json_output: bool,
+    settings: Mapping[str, object], keep_heading: bool, topics_file: Path | None, figure_file: Path | None,
+    tum_file: Path | None, peers: bool, json_output: bool,
 ) -> None:  # fmt: skip
     """Map the beacons of a recorded run and find the vehicle's path on that map.
 
-    PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, a CSV of events, or a ROS bag
-    (docs/radio_data.md).
+    PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, a CSV of events, tables with headers, a factor
+    graph (pyfg), or a ROS bag (docs/radio_data.md).
     """
     from ccatp.beacons.config.load import load_recordings_config
     from ccatp.beacons.datasets.reader import read_run
@@ -65,7 +68,7 @@ def slam(
     from ccatp.studies.results import markdown_table
 
     assumed = load_recordings_config(config_file, settings)
-    run = read_run(path, data_format, robot, topics_file)
+    run = read_run(path, data_format, robot, topics_file, turns_heading=not keep_heading)
     common.warn(run.warnings)
     track = estimate(run, assumed, filter_name)
     common.warn(track.warnings)

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.beacons.cricket.map_fit import map_rms_m
+from ccatp.beacons.datasets.consistency import inconsistencies
 from ccatp.beacons.datasets.tables import GAP_S, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor
 from ccatp.beacons.estimation.recording import EstimatedPath, Readings, RecordedRun, ReferencePath, Steps
@@ -186,7 +187,7 @@ FASTEST_M_S = 50.0
 def suspicions(run: RecordedRun) -> list[str]:
     """All warnings, the most basic first. A check that fails on strange data gives a warning that says so."""
     found: list[str] = []
-    for check in (_gaps, _units, _signs, _against_truth, _map_of):
+    for check in (_gaps, _units, _signs, inconsistencies, _against_truth, _map_of):
         try:
             found += check(run)
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:

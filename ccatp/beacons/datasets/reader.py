@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from ccatp.beacons.datasets.assembly import checked_run
+from ccatp.beacons.datasets.columns import is_columns, read_columns
 from ccatp.beacons.datasets.events import is_events_csv, read_events_csv
 from ccatp.beacons.datasets.formats import (
     ROBOT_FILE,
@@ -13,13 +14,21 @@ from ccatp.beacons.datasets.formats import (
     read_plaza,
     robots_in,
 )
+from ccatp.beacons.datasets.pyfg import is_pyfg, read_pyfg
 from ccatp.beacons.datasets.ros_bags import SUFFIXES as BAGS
 from ccatp.beacons.datasets.ros_bags import read_bag
 from ccatp.beacons.datasets.tables import RadioDataError, content_lines, read_text
 from ccatp.beacons.estimation.recording import RecordedRun
 
-READERS = {"plaza": read_plaza, "labyrinth": read_labyrinth, "csv": read_events_csv}
-FORMATS = ("plaza", "mrclam", "labyrinth", "csv", "bag")
+TEXTS = (".txt", ".csv", ".tsv")
+READERS = {
+    "plaza": read_plaza,
+    "labyrinth": read_labyrinth,
+    "csv": read_events_csv,
+    "columns": read_columns,
+    "pyfg": read_pyfg,
+}
+FORMATS = ("plaza", "mrclam", "labyrinth", "csv", "columns", "pyfg", "bag")
 
 
 def read_run(
@@ -57,17 +66,21 @@ def found_format(path: Path, given: str | None = None) -> str:
     if robots_in(path) if is_folder else ROBOT_FILE.search(path.name):
         return "mrclam"
     texts = {
-        file: read_text(file) for file in files if not is_plaza(file) and (not is_folder or ".txt" in file.suffixes)
+        file: read_text(file) for file in files if not is_plaza(file) and (not is_folder or {*TEXTS} & {*file.suffixes})
     }
     if any(is_labyrinth(text) for text in texts.values()):
         return "labyrinth"
     if is_plaza(path):
         return "plaza"
+    if any(is_columns(text) for text in texts.values()):
+        return "columns"
     for text in () if is_folder else texts.values():
         if not content_lines(text):
             raise RadioDataError(path, "is empty: no line but comments; give a recording")
         if is_events_csv(text):
             return "csv"
+        if is_pyfg(text):
+            return "pyfg"
     raise RadioDataError(
         path, f"none of the formats {', '.join(FORMATS)}; if it is one, name it with --format; see docs/radio_data.md"
     )

@@ -3,9 +3,10 @@
 import numpy as np
 import numpy.typing as npt
 
-from ccatp.beacons.datasets.tables import long_pauses
+from ccatp.beacons.datasets.tables import Table, long_pauses
 from ccatp.beacons.estimation.recording import ReferencePath, Steps, antenna_path, dead_reckoned, running_total
 from ccatp.core import FloatArray
+from ccatp.filters.metrics import wrapped
 
 BEFORE_S = 1.0  # time before a gap over which the speed is measured
 WINDOWS = 1000  # samples of the run at which the speed is compared with the speed before
@@ -30,6 +31,19 @@ def amount_at(steps: Steps, amounts: FloatArray | float, times_s: FloatArray) ->
     total = running_total(np.broadcast_to(amounts, steps.distance_m.shape))
     found: FloatArray = np.interp(times_s, steps.times_s, total)
     return found
+
+
+def motions_between(poses: Table) -> Table:
+    """Odometry from rows of time, x, y and heading, shape (n, 4): the motion since the row before, along and across.
+
+    The first row has none.
+    """
+    values = poses.values
+    turn = wrapped(np.diff(values[:, 3]))
+    dx, dy, middle = np.diff(values[:, 1]), np.diff(values[:, 2]), values[:-1, 3] + 0.5 * turn
+    c, s = np.cos(middle), np.sin(middle)
+    moves = np.column_stack([c * dx + s * dy, turn, c * dy - s * dx])
+    return poses._replace(values=np.column_stack([values[:, 0], np.vstack([np.zeros((1, 3)), moves])]))
 
 
 def way_at(steps: Steps, times_s: FloatArray) -> FloatArray:

@@ -231,3 +231,55 @@ def test_a_turned_heading_can_be_kept(tmp_path: Path) -> None:
     run, said = read(tmp_path, turned)
     assert "it was turned back" in said
     assert run.first_pose[2] == pytest.approx(W.poses[0, 2], abs=0.05)
+
+
+def scaled(kind: str, column: int, factor: float) -> Change:
+    return each(kind, lambda _, cells: [*cells[:column], str(float(cells[column]) * factor), *cells[column + 1 :]])
+
+
+def without(kind: str, then: Change) -> Change:
+    return lambda lines: then([line for line in lines if not line.startswith(f"{kind},")])
+
+
+def all_times(factor: float) -> Change:
+    def change(lines: list[str]) -> list[str]:
+        for kind in ("odom", "range", "truth"):
+            lines = scaled(kind, 1, factor)(lines)
+        return lines
+
+    return change
+
+
+def moved_clock(kind: str, by_s: float, from_s: float = 0.0) -> Change:
+    def change(_: int, cells: list[str]) -> list[str]:
+        time_s = float(cells[1])
+        return [cells[0], str(time_s + by_s * (time_s > from_s)), *cells[2:]]
+
+    return each(kind, change)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (all_times(1000.0), "odometry comes every 100 s at 0.00065 m/s: are its times in milliseconds?"),
+        (without("truth", scaled("range", 3, 1000.0)), "the odometry travels: are they in millimetres"),
+        (without("truth", scaled("range", 3, 100.0)), "the odometry travels: are they in centimetres"),
+        (without("truth", scaled("range", 3, 3.2808)), "the odometry travels: are they in feet?"),
+        (without("truth", scaled("odom", 3, 57.29578)), "turns 0.0175 times as much: are its turns in degrees?"),
+        (scaled("beacon", 2, 1000.0), "are their places in millimetres or centimetres?"),
+        (moved_clock("truth", -3.0), "the truth fits the odometry best if taken 3 s later"),
+        (without("truth", moved_clock("range", 3.0)), "ranges fit the odometry best if taken 3.1 s earlier"),
+    ],
+)  # fmt: skip
+def test_a_unit_or_a_clock_of_another_kind_is_named(tmp_path: Path, change: Change, what: str) -> None:
+    assert what in read(tmp_path, change)[1]
+
+
+def test_a_check_that_fails_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: RecordedRun) -> list[str]:
+        raise TypeError("expected non-empty vector")
+
+    monkeypatch.setattr("ccatp.beacons.datasets.checks._gaps", fail)
+    run, said = read(tmp_path, list)
+    assert "the check of fail cannot be made on these data (expected non-empty vector)" in said
+    assert run.readings.range_m.size == W.range_m.size

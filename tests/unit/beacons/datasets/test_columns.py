@@ -1,0 +1,113 @@
+"""Tables with headers and factor graphs give the run that the CSV of events gives."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.config.load import load_recordings_config
+from ccatp.beacons.datasets.pyfg import pyfg_lines
+from ccatp.beacons.datasets.reader import read_run
+from ccatp.beacons.datasets.tables import RadioDataError
+from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, world, write_lines
+
+W = world(seconds=20.0)
+NAMES = list(BEACONS)
+RANGES = [(t, NAMES[b], r) for t, b, r in zip(W.read_s, W.read_beacon.tolist(), W.range_m, strict=True)]
+POSES = [(t, *pose) for t, pose in zip(W.times_s, W.poses.tolist(), strict=True)]
+
+
+def lines_of(header: str, rows: Sequence[tuple[object, ...]], mark: str = ",") -> list[str]:
+    return [header.replace(",", mark), *(mark.join(map(str, row)) for row in rows)]
+
+
+def long_form(folder: Path) -> Path:
+    write_lines(folder / "odometry.csv", lines_of("time,x,y,yaw", POSES))
+    write_lines(folder / "ground_truth.csv", lines_of("time,x,y,yaw", POSES))
+    write_lines(folder / "anchors.csv", lines_of("anchor,x,y", [(name, *at) for name, at in BEACONS.items()]))
+    return write_lines(folder / "uwb.csv", lines_of("time,anchor,range", RANGES))
+
+
+def in_units(folder: Path) -> Path:
+    long_form(folder)
+    rows: list[tuple[object, ...]] = [(1e3 * t, name, 1e3 * r) for t, name, r in RANGES]
+    write_lines(folder / "uwb.csv", lines_of("time [ms],anchor,range_mm", rows, ";"))
+    rate = np.diff(W.times_s)
+    speeds = [(t, v, w) for t, v, w in zip(W.times_s, W.distance_m / rate, W.turn_rad / rate, strict=False)]
+    write_lines(folder / "odometry.csv", lines_of("t,vx,yaw_rate (rad/s)", [*speeds, (W.times_s[-1], 0, 0)]))
+    return folder
+
+
+def wide_form(folder: Path) -> Path:
+    long_form(folder)
+    rows = [(t, *(r if name == one else "" for one in NAMES)) for t, name, r in RANGES]
+    write_lines(folder / "uwb.csv", lines_of("time," + ",".join(f"range {name} [m]" for name in NAMES), rows))
+    return folder
+
+
+def as_graph(folder: Path) -> Path:
+    run = read_run(write_lines(folder / "run.csv", csv_lines(W)), None, None)
+    lines = pyfg_lines(run, load_recordings_config().csv, np.column_stack(run.truth[1:]) if run.truth else W.poses)
+    (folder / "run.csv").unlink()
+    return write_lines(folder / "graph.pyfg", lines)
+
+
+@pytest.mark.parametrize("make", [long_form, in_units, wide_form, as_graph])
+def test_the_same_run_comes_from_tables_and_from_a_graph(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    found = read_run(make(tmp_path), None, None)
+    np.testing.assert_allclose(np.sort(found.readings.range_m), np.sort(W.range_m), atol=1e-7)
+    np.testing.assert_allclose(found.readings.times_s, W.read_s, atol=1e-7)
+    assert sorted(at for at in found.beacon_truth_m.values()) == sorted(BEACONS.values())
+    assert found.steps.turn_rad.sum() == pytest.approx(
+        np.interp(found.steps.times_s[-1], W.times_s, W.poses[:, 2]) - 0.4
+    )
+    assert found.first_pose == pytest.approx(W.poses[0], abs=1e-6)
+    assert found.kind == "csv"
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda folder: (folder / "odometry.csv").unlink(), "has 0 tables of odometry and 1 of truth beside uwb.csv"),
+        (lambda folder: write_lines(folder / "odometry.csv", ["time,x,y", "0,0,0"]), "x and y has no heading"),
+        (lambda folder: write_lines(folder / "odometry.csv", ["time,x,y,yaw", "0,a,0,0"]), "csv:2: x is 'a'"),
+        (lambda folder: write_lines(folder / "odometry.csv", ["time,x,y,yaw"]), "holds no rows below its header"),
+        (lambda folder: write_lines(folder / "more.csv", ["time,x,y,yaw", "0,0,0,0"]), "has 2 tables of odometry"),
+    ],
+)  # fmt: skip
+def test_a_table_that_is_missing_or_wrong_is_one_line(
+    change: Callable[[Path], object], what: str, tmp_path: Path
+) -> None:
+    file = long_form(tmp_path)
+    change(tmp_path)
+    with pytest.raises(RadioDataError, match=what):
+        read_run(file, None, None)
+
+
+@pytest.mark.parametrize(
+    ("lines", "what"),
+    [
+        (["VERTEX_SE2 0 A0 0 0 0"], "has no odometry: no EDGE_SE2"),
+        (["VERTEX_SE3:QUAT 0 A0 0 0 0 0 0 0 1"], "'VERTEX_SE3:QUAT' is none of .* only graphs in the plane"),
+        (["EDGE_SE2 0 A0 A1 1 0"], "pyfg:1: 5 words after EDGE_SE2, wanted 12"),
+    ],
+)
+def test_a_graph_that_is_none_is_one_line(lines: list[str], what: str, tmp_path: Path) -> None:
+    with pytest.raises(RadioDataError, match=what):
+        read_run(write_lines(tmp_path / "a.pyfg", lines), None, None)
+
+
+def test_a_graph_without_times_of_several_vehicles_with_loop_closures(tmp_path: Path) -> None:
+    cov = "0.01 0 0 0.01 0 0.04"
+    lines = ["VERTEX_XY L0 5 5"]
+    lines += [f"EDGE_SE2 0.0 A{k} A{k + 1} 1 0 0.1 {cov}" for k in range(8)]
+    lines += [f"EDGE_SE2 0.0 A0 A7 1 0 0.1 {cov}", f"EDGE_SE2 0.0 B0 B1 1 0 0.1 {cov}", "EDGE_RANGE 0.0 A1 B1 3 0.01"]
+    lines += ["EDGE_RANGE 0.0 A2 L0 4 0.01", "EDGE_SE2_XY 0.0 A3 L0 3 4 0.01 0 0.01"]
+    run = read_run(write_lines(tmp_path / "a.pyfg", lines), None, None)
+    said = " | ".join(run.warnings)
+    for what in ("of the vehicles A, B only A", "each step is taken as one second", "1 loop closure not used"):
+        assert what in said
+    assert "1 range between vehicles not used" in said
+    assert run.readings.range_m.tolist() == [4.0, 5.0]
+    assert run.readings.times_s.tolist() == [2.0, 3.0]
