@@ -119,8 +119,8 @@ def _against_survey(run: RecordedRun, path: FloatArray) -> Iterator[str]:
     extent_m, usual_m = float(np.hypot(*np.ptp(path[:, :2], axis=0))), float(np.median(ranges))
     if usual_m > WIDE * (width_m + extent_m):
         yield (
-            f"half of the ranges are longer than {usual_m:.3g} m, among beacons and ways of {width_m + extent_m:.3g} m: "
-            "are ranges in millimetres or centimetres?"
+            f"half of the ranges are longer than {usual_m:.3g} m, among beacons and ways of {width_m + extent_m:.3g} m:"
+            " are ranges in millimetres or centimetres?"
         )
     elif width_m > WIDE * (usual_m + extent_m):
         yield (
