@@ -157,18 +157,20 @@ _PLAIN = ("boolean", "string", "number", "integer")
 
 
 def plain_schema(schema: Mapping[str, Any], title: str) -> dict[str, Any]:
-    """A schema of ``msgspec.json.schema`` in the form for viewers."""
+    """A schema of ``msgspec.json.schema`` in the form for viewers; a type within itself is any object there."""
     return {**_resolved(schema, schema.get("$defs", {})), "title": title}
 
 
-def _resolved(node: Any, definitions: Mapping[str, Any]) -> Any:
+def _resolved(node: Any, definitions: Mapping[str, Any], within: frozenset[str] = frozenset()) -> Any:
+    """``within``: the definitions of which the node is a part."""
     if isinstance(node, list):
-        return [_resolved(one, definitions) for one in node]
+        return [_resolved(one, definitions, within) for one in node]
     if not isinstance(node, Mapping):
         return node
     if "$ref" in node:
-        return _resolved(definitions[str(node["$ref"]).rpartition("/")[2]], definitions)
-    found = {key: _resolved(value, definitions) for key, value in node.items() if key not in ("$defs", "title")}
+        name = str(node["$ref"]).rpartition("/")[2]
+        return {"type": "object"} if name in within else _resolved(definitions[name], definitions, within | {name})
+    found = {key: _resolved(value, definitions, within) for key, value in node.items() if key not in ("$defs", "title")}
     if found.get("type") == "object" and "properties" in found:
         fields = found["properties"]
         found["properties"] = {name: value for name, value in fields.items() if _is_plain(value)}
