@@ -80,6 +80,8 @@ def study(
                 raise CampaignError(f"study {name} has no peers; leave --peers out")
             found = replace(found, cells=found.with_peers)
         load = found.loader.get()
+        if found.of_config is not None:
+            found = found.of_config(found, load(config_file, settings))
         result = run_campaign(found, lambda keys: load(config_file, keys), options)
     else:
         idle = {"--cluster": cluster, "--shard": shard, "--from": others, "--only": only, "--mirror": mirrors}

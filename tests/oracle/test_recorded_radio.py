@@ -9,7 +9,8 @@ from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.estimation.batch_smoother import smooth
 from ccatp.beacons.estimation.evaluation import TrackEvaluation, judge, result_data
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
-from ccatp.beacons.studies.recordings import estimate, shipped_window
+from ccatp.beacons.studies.recorded_sets import recorded_window
+from ccatp.beacons.studies.recordings import estimate
 from tests.support.scenario import RADIO_DATA
 
 PLAZA2_S = 409.523  # how long it takes
@@ -42,7 +43,7 @@ def test_plaza2_smoothed() -> None:
 @pytest.mark.parametrize("share", [0.1, 0.4])
 def test_plaza2_started_later(share: float) -> None:
     """The filter, and the fixed-lag smoother; of four tenths a beacon joined 16 m off and its path was 3.2 m off."""
-    run = shipped_window(str(DATA), "Plaza2", None, share * PLAZA2_S, PLAZA2_S)
+    run = recorded_window(str(DATA), "Plaza2", None, share * PLAZA2_S, PLAZA2_S)
     track = estimate(run, load_recordings_config(), "fixed-lag")
     found, late = judge(track, run), result_data(run, "fixed-lag", track, judge(track, run))["delayed"]
     assert found.trajectory_rmse_m is not None

@@ -48,12 +48,19 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
     type=common.OutputFile(),
     help="Write the path as evo reads it; the truth to NAME_truth beside it.",
 )
+@click.option(
+    "--out",
+    "out_dir",
+    type=common.PATH,
+    metavar="DIR",
+    help="Write path, map, readings with innovations, and a factor graph.",
+)
 @click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
 @common.JSON_OPTION
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
     settings: Mapping[str, object], keep_heading: bool, topics_file: Path | None, figure_file: Path | None,
-    tum_file: Path | None, peers: bool, json_output: bool,
+    tum_file: Path | None, out_dir: Path | None, peers: bool, json_output: bool,
 ) -> None:  # fmt: skip
     """Map the beacons of a recorded run and find the vehicle's path on that map.
 
@@ -77,6 +84,10 @@ def slam(
     data: dict[str, Any] = result_data(run, filter_name, track, judged) | reviewed(run, track, noise)
     if tum_file is not None:
         _write_tum(tum_file, run, track)
+    if out_dir is not None:
+        from ccatp.beacons.report.slam_files import write_slam
+
+        write_slam(out_dir, run, track, getattr(assumed, run.kind))
     if figure_file is not None:
         from ccatp.beacons.report.plots import draw_slam
 

@@ -18,6 +18,7 @@ from ccatp.beacons.estimation.recording import (
     DelayedPath,
     EstimatedPath,
     Reading,
+    ReadingInnovation,
     RecordedRun,
     Steps,
 )
@@ -182,7 +183,7 @@ def follow(
         if window is not None:
             window.keep(float(times[k]), search)
         if now := readings[begin:end]:
-            log.take(search.observe(now), len(now), clock_s() - predicted_s)
+            log.take(float(times[k]), search.observe(now), len(now), clock_s() - predicted_s)
         poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
     delayed = None if window is None else window.path(search.best)
     path = _result(run, search.best, log)
@@ -193,12 +194,14 @@ class _Log:
     """Innovations and elapsed times, s: ``predict_s`` by instant, ``update_s`` by reading, ``scalar_s`` by scalar."""
 
     def __init__(self) -> None:
-        self.learned, self.predict_s = list[BeaconInnovation](), list[float]()
+        self.learned, self.times_s = list[BeaconInnovation](), list[float]()
+        self.predict_s = list[float]()
         self.update_s, self.scalar_s = list[float](), list[float]()
 
-    def take(self, learned: Sequence[BeaconInnovation], count: int, lasted_s: float) -> None:
+    def take(self, time_s: float, learned: Sequence[BeaconInnovation], count: int, lasted_s: float) -> None:
         """Add the innovations of the ``count`` readings of an instant, which took ``lasted_s``."""
         self.learned += learned
+        self.times_s += [time_s] * len(learned)
         self.update_s += [(self.predict_s[-1] + lasted_s) / count] * count
         if len(learned) == count:  # only updates: no reading waits, no beacon joins
             scalars = sum(one.size for one in learned)
@@ -232,6 +235,10 @@ def _result(run: RecordedRun, slam: BeaconSlam, log: _Log) -> EstimatedPath:
         predict_s=np.array(log.predict_s[1:]),
         scalar_s=np.array(log.scalar_s),
         map_covariance=slam.engine.covariance[np.ix_(at, at)],
+        innovations=tuple(
+            ReadingInnovation(time_s, str(one.beacon), one.nis, one.size, one.accepted)
+            for time_s, one in zip(log.times_s, log.learned, strict=True)
+        ),
     )  # fmt: skip
 
 

@@ -142,6 +142,16 @@ class DelayedPath(NamedTuple):
     covariances: FloatArray  # shape (n, 3, 3)
 
 
+class ReadingInnovation(NamedTuple):
+    """Innovation of one reading of a causal estimator."""
+
+    time_s: float
+    beacon: str
+    nis: float
+    size: int  # degrees of freedom
+    is_used: bool
+
+
 class EstimatedPath(NamedTuple):
     """An estimate of a run.
 
@@ -166,6 +176,7 @@ class EstimatedPath(NamedTuple):
     scalar_s: FloatArray = np.empty(0)
     delayed: DelayedPath | None = None
     map_covariance: FloatArray = np.empty((0, 0))  # of all beacons' x_m, y_m in their order, shape (2 b, 2 b)
+    innovations: tuple[ReadingInnovation, ...] = ()  # of all readings of beacons on the map; empty from a smoother
 
 
 BeaconId = int | str

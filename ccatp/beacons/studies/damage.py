@@ -12,16 +12,8 @@ from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.datasets.tables import RadioDataError, Table
 from ccatp.beacons.estimation.evaluation import TrackEvaluation, judge, truth_at
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, ReferencePath
-from ccatp.beacons.studies.recordings import (
-    FILTERS,
-    SETS,
-    EstimateError,
-    estimate,
-    events_of,
-    read_again,
-    shipped_run,
-    shipped_window,
-)
+from ccatp.beacons.studies.recorded_sets import events_of, read_again, recorded_run, recorded_window, sets_in
+from ccatp.beacons.studies.recordings import FILTERS, EstimateError, estimate
 from ccatp.core import FloatArray
 from ccatp.missions import Part
 from ccatp.studies.campaign import Cell, Factors, Job, JobOutcome, Study
@@ -39,6 +31,10 @@ _NO_ALARM = "before the first or after the last odometry"  # most recordings hav
 _COVERED = 13.8  # chi-squared of two degrees of freedom, 99.9 %
 
 Tables = dict[str, Table]
+
+
+class DamageImpossibleError(ValueError):
+    """A recording has not what a damage needs: two surveyed beacons apart."""
 
 
 class Damage(NamedTuple):
@@ -96,10 +92,15 @@ def _two_beacons(damage: Damage) -> tuple[int, int]:
     placed = sorted(
         (k for k, name in enumerate(run.beacon_ids) if name in run.beacon_truth_m), key=lambda k: -counts[k]
     )
+    if not placed:
+        raise DamageImpossibleError
     first, *others = placed
     at = np.array([run.beacon_truth_m[run.beacon_ids[k]] for k in placed])
     apart_m = np.hypot(*(at - at[0]).T)[1:]
-    return first, next(k for k, far_m in zip(others, apart_m, strict=True) if far_m > APART_M)
+    second = next((k for k, far_m in zip(others, apart_m, strict=True) if far_m > APART_M), None)
+    if second is None:
+        raise DamageImpossibleError
+    return first, second
 
 
 def straight(damage: Damage) -> Damage:
@@ -237,31 +238,45 @@ DAMAGES: dict[str, Callable[[Damage], Damage]] = {
     "25 % of the ranges by reflection": reflected,
     "5 % ranges of 0 m": zeros,
 }
-CASES = [(name, robot, window) for name, one in SETS.items() for robot in one.robots for window in range(WINDOWS)]
-OUTCOMES = ("recovered", "reported", "uncertain", "wrong")
+OUTCOMES = ("recovered", "reported", "uncertain", "wrong", "impossible")
+
+
+@cache
+def cases_of(folder: str) -> list[tuple[str, int | None, int]]:
+    """Set, robot and window of each case."""
+    sets = sets_in(folder).items()
+    return [(name, robot, window) for name, one in sets for robot in one.robots for window in range(WINDOWS)]
 
 
 @cache
 def _undamaged(folder: str, case: int, assumed: RecordingsConfig) -> tuple[RecordedRun, EstimatedPath, TrackEvaluation]:
-    name, robot, window = CASES[case]
-    whole = shipped_run(folder, name, robot)
+    name, robot, window = cases_of(folder)[case]
+    whole = recorded_run(folder, name, robot)
     span_s = float(whole.steps.times_s[-1] - whole.steps.times_s[0])
     begin_s = max(span_s - WINDOW_S, 0.0) * window / (WINDOWS - 1)
-    run = shipped_window(folder, name, robot, begin_s, WINDOW_S)
+    run = recorded_window(folder, name, robot, begin_s, WINDOW_S)
     track = estimate(replace(run, truth=None), assumed, FILTERS[0])
     return run, track, judge(track, run)
 
 
 def run_damage(job: Job) -> JobOutcome:
     """Run the filter on one damaged window; its outcome is one of ``OUTCOMES``."""
-    cfg, kind, case = job.cfg, str(job.factors["damage"]), job.seed % len(CASES)
+    cfg, kind, case = job.cfg, str(job.factors["damage"]), job.seed % len(cases_of(job.cfg.run.data))
     run, track, before = _undamaged(cfg.run.data, case, cfg)
     tables, truth = events_of(run, 0.0, WINDOW_S)
     middle_s = float(run.steps.times_s[0]) + 0.5 * WINDOW_S
     rng = np.random.default_rng((job.seed, list(DAMAGES).index(kind)))
-    damage = DAMAGES[kind](Damage(tables, truth, run, track, middle_s, rng))
-    values: dict[str, Any] = {"case": " ".join(map(str, CASES[case])), "path_m": None, "beacons_m": None, "new": []}
+    values: dict[str, Any] = {
+        "case": " ".join(map(str, cases_of(cfg.run.data)[case])),
+        "path_m": None,
+        "beacons_m": None,
+        "new": [],
+    }
     values |= {"path_before_m": before.trajectory_rmse_m, "beacons_before_m": before.beacon_rmse_m}
+    try:
+        damage = DAMAGES[kind](Damage(tables, truth, run, track, middle_s, rng))
+    except DamageImpossibleError:
+        return JobOutcome(values | {"outcome": "impossible", "unsurveyed": "impossible"})
     try:
         again = read_again(damage.run, damage.tables, damage.truth)
         found = estimate(replace(again, truth=None), cfg, FILTERS[0])
@@ -312,6 +327,7 @@ STUDY = Study(
     columns=f"{' '.join(OUTCOMES)} wrong_unsurveyed wrong_cases",
     draw=lambda _cells, _out: None,
     mirrors=(),
-    runs=len(CASES),
+    of_config=lambda study, cfg: replace(study, runs=len(cases_of(cfg.run.data))),
+    runs=30,
     loader=Part("ccatp.beacons.config.load:load_recordings_config"),
 )

@@ -4,33 +4,27 @@ The estimators are our own ones, and with ``--peers`` those of GTSAM.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.cricket.measured_map import map_measured
-from ccatp.beacons.datasets.assembly import checked_run
 from ccatp.beacons.datasets.checks import survey_doubts
-from ccatp.beacons.datasets.events import Recording
-from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
-from ccatp.beacons.datasets.tables import Table
-from ccatp.beacons.datasets.trajectory import pose_of_truth
 from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
 from ccatp.beacons.estimation.causal import filter_run
 from ccatp.beacons.estimation.evaluation import judge, result_data
 from ccatp.beacons.estimation.level_fix import LevelLocator, fingerprint_fits, grid_points, judged
 from ccatp.beacons.estimation.path_loss import fit_path_loss
-from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, ReferencePath
+from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, import_gtsam, run_gtsam
-from ccatp.core import FloatArray
+from ccatp.beacons.studies.recorded_sets import SHIPPED, recorded_run, recorded_window, sets_in
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.filters.base import FilterError
 from ccatp.missions import Part
@@ -102,74 +96,12 @@ def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[s
     return rows
 
 
-# -- the shipped sets -------------------------------------------------------------------------------------------------
-
-
-class RecordedSet(NamedTuple):
-    """Path of a set in the folder of recordings, and its robots."""
-
-    path: str
-    robots: tuple[int | None, ...] = (None,)
-
-
-SETS = {
-    "Plaza2": RecordedSet("plaza/Plaza2_.mat"),
-    "MRCLAM 7": RecordedSet("mrclam/set7", (1, 2, 3, 4, 5)),
-    "Labyrinth": RecordedSet("uwb_labyrinth/labyrinth_0_600s.txt.gz"),
-    "MRCLAM 3": RecordedSet("mrclam/set3", (3, 5)),
-}
 ANCHORS = "UWB anchors 8/14"
 ANCHOR_METHODS = {"batch": False, "batch, offset": True}
 LEVELS = "XBee scenario 1"
 LEVEL_METHODS = ("fingerprints", "fingerprints, each by the others", "path-loss sheet")
 XBEE_M = {"A": (0.0, 0.0), "B": (0.0, 4.0), "C": (4.0, 0.0)}  # corners of a square of 4 m: fits text and levels
 XBEE_ROOM = grid_points((-1.0, -1.0), (5.0, 5.0), 0.1)
-
-
-@cache
-def shipped_run(folder: str, name: str, robot: int | None) -> RecordedRun:
-    """One run of a set. Raises CampaignError: no folder is given. Raises RadioDataError: the set does not exist."""
-    if not folder:
-        raise CampaignError("where the recordings are is not known; give --data DIR")
-    return read_run(Path(folder) / SETS[name].path, None, robot)
-
-
-@cache
-def shipped_window(folder: str, name: str, robot: int | None, begin_s: float, length_s: float) -> RecordedRun:
-    """A part of a run, times in s from the beginning of the run; its first pose is from the truth, if there is one.
-
-    The checks of the reader do not use the truth.
-    """
-    run = shipped_run(folder, name, robot)
-    tables, truth = events_of(run, begin_s, begin_s + length_s)
-    return read_again(run, tables, truth)
-
-
-def events_of(run: RecordedRun, begin_s: float, end_s: float) -> tuple[dict[str, Table], ReferencePath | None]:
-    """The recorded events of a part of a run, as tables of our CSV format, and the truth of that part."""
-    start_s = run.steps.times_s[0]
-
-    def table(*columns: FloatArray) -> Table:
-        values = np.column_stack(columns)
-        inside = (values[:, 0] >= start_s + begin_s) & (values[:, 0] <= start_s + end_s)
-        return Table(Path(run.name), values[inside], np.flatnonzero(inside) + 1)
-
-    steps, readings, known = run.steps, run.readings, np.isfinite
-    moves = (np.concatenate([[0.0], column]) for column in (steps.distance_m, steps.turn_rad, steps.lateral_m))
-    tables = {"odom": table(steps.times_s, *moves)}
-    for kind, column in zip(("range", "bearing", "rssi"), readings[2:], strict=True):
-        there = known(column)
-        if there.any():
-            tables[kind] = table(readings.times_s[there], readings.beacon[there].astype(float), column[there])
-    truth = None if run.truth is None else ReferencePath(*table(*run.truth).values.T)
-    return tables, truth
-
-
-def read_again(run: RecordedRun, tables: Mapping[str, Table], truth: ReferencePath | None) -> RecordedRun:
-    """A run from tables of events, as read and checked by the reader without the truth, which is added afterwards."""
-    again = checked_run(Recording(Path(run.name), run.name, run.kind, tables, run.beacon_ids))
-    pose = pose_of_truth(truth, again.steps, [])
-    return replace(again, first_pose=pose, truth=truth, beacon_truth_m=run.beacon_truth_m)
 
 
 # -- recordings -------------------------------------------------------------------------------------------------------
@@ -191,11 +123,11 @@ def run_recordings(job: Job) -> JobOutcome:
     if name == LEVELS:
         return _fixed_levels(Path(cfg.run.data) / "xbee_rssi/Scenario1", share, estimator)
     rows = []
-    for robot in SETS[name].robots:
-        run = shipped_run(cfg.run.data, name, robot)
+    for robot in sets_in(cfg.run.data)[name].robots:
+        run = recorded_run(cfg.run.data, name, robot)
         if share > 0.0:
             span_s = float(run.steps.times_s[-1] - run.steps.times_s[0])
-            run = shipped_window(cfg.run.data, name, robot, share * span_s, span_s)
+            run = recorded_window(cfg.run.data, name, robot, share * span_s, span_s)
         begin_s = perf_counter()
         if estimator in FILTERS:
             track, run_s = estimate(run, cfg, estimator), None
@@ -276,9 +208,20 @@ def combine_recordings(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome
 
 def recordings_cells(estimators: Sequence[str] = FILTERS) -> list[Cell]:
     """Sets times estimators, the map of surveyed anchors, and positions from levels (mean error as ``path_m``)."""
-    cells = [Cell({"data": name, "estimator": one}) for name in SETS for one in estimators]
+    cells = [Cell({"data": name, "estimator": one}) for name in SHIPPED for one in estimators]
     others = {ANCHORS: ANCHOR_METHODS, LEVELS: LEVEL_METHODS}
     return cells + [Cell({"data": name, "estimator": one}) for name, methods in others.items() for one in methods]
+
+
+def of_folder(study: Study, cfg: RecordingsConfig) -> Study:
+    """The study of the sets that the folder holds, with the estimators of the study."""
+    sets = sets_in(cfg.run.data)
+    shipped = [cell for cell in study.cells() if cell.factors["data"] in (*sets, ANCHORS, LEVELS)]
+    if any(cell.factors["data"] in sets for cell in shipped):
+        return replace(study, cells=lambda: shipped)
+    estimators = dict.fromkeys(cell.factors["estimator"] for cell in study.cells() if cell.factors["data"] in SHIPPED)
+    own = [Cell({"data": name, "estimator": one}) for name in sets for one in estimators]
+    return replace(study, cells=lambda: own)
 
 
 def draw_recordings(cells: Sequence[CellResult], out: Path) -> None:
@@ -303,6 +246,7 @@ RECORDINGS = Study(
     """,
     draw=draw_recordings,
     mirrors=(),
+    of_config=of_folder,
     runs=6,
     loader=Part("ccatp.beacons.config.load:load_recordings_config"),
 )

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,32 @@ def test_json_is_the_contracts(
     assert data["nees_mean"] > 0.0
     assert (data["delayed"] is None) == (filter_name != "fixed-lag")
     assert all(warning in err for warning in data["warnings"])
+
+
+def test_the_result_is_written_as_files_of_which_the_graph_is_read_again(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out_dir = tmp_path / "result"
+    data = reported(capsys, "slam", recording, "--filter", "fixed-lag", "--out", out_dir, "--json")
+    path = np.genfromtxt(out_dir / "path.csv", delimiter=",", names=True)
+    assert path.dtype.names is not None
+    assert path.dtype.names[:4] == ("time_s", "x_m", "y_m", "heading_rad")
+    assert (path["xx_m2"] > 0.0).all()
+    assert (out_dir / "path_delayed.csv").is_file()
+    found = tomllib.loads((out_dir / "map.toml").read_text(encoding="utf-8"))
+    assert found["beacons"].keys() == data["beacons"].keys()
+    for name, one in found["beacons"].items():
+        assert one["position_m"] == pytest.approx(data["beacons"][name], abs=0.05)  # those of the data are aligned
+    assert np.shape(found["joint"]["covariance_m2"]) == (8, 8)
+    readings = (out_dir / "readings.csv").read_text(encoding="utf-8").splitlines()
+    assert readings[0].endswith("residual_m,nis,nis_size,is_used")
+    used = [line for line in readings if line.endswith(",1")]
+    assert len(used) == data["updates"]
+    graph = reported(capsys, "slam", out_dir / "graph.pyfg", "--json")
+    assert graph["beacon_rmse_m"] < 0.5
+    status, _, err = said(capsys, "radio", "slam", recording, "--out", recording)
+    assert status == 2
+    assert "cannot be written" in err
 
 
 def test_what_is_not_known_is_null(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

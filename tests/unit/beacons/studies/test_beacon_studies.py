@@ -17,10 +17,11 @@ from ccatp.beacons.studies.gtsam_peer import PeerGaveUp
 from ccatp.beacons.studies.mote_navigation import combine as mote_navigation_combine
 from ccatp.beacons.studies.mote_runs import run_batch, run_filter, simulate_field, sure_rms_m
 from ccatp.beacons.studies.radio_bound import TrueStep, radio_bound
-from ccatp.beacons.studies.recordings import combine_recordings, estimate, events_of, run_recordings
+from ccatp.beacons.studies.recorded_sets import RecordedSet, events_of, sets_in
+from ccatp.beacons.studies.recordings import RECORDINGS, combine_recordings, estimate, run_recordings
 from ccatp.config.models import Config
 from ccatp.studies.campaign import CampaignError, Cell, CellResult, Job, JobOutcome
-from tests.unit.beacons.datasets.sets import recorded, world
+from tests.unit.beacons.datasets.sets import csv_lines, recorded, world, write_lines, write_mrclam
 
 # One worker computes the cells that they share.
 pytestmark = pytest.mark.xdist_group("beacon studies")
@@ -194,7 +195,8 @@ def test_a_peer_that_gives_up_on_a_later_start_is_counted(monkeypatch: pytest.Mo
     def give_up(*_: object) -> None:
         raise PeerGaveUp("no result")
 
-    monkeypatch.setattr("ccatp.beacons.studies.recordings.shipped_run", lambda *_: recorded(world(seconds=20.0)))
+    monkeypatch.setattr("ccatp.beacons.studies.recordings.sets_in", lambda _: {"Plaza2": RecordedSet("")})
+    monkeypatch.setattr("ccatp.beacons.studies.recordings.recorded_run", lambda *_: recorded(world(seconds=20.0)))
     monkeypatch.setattr("ccatp.beacons.studies.recordings.run_gtsam", give_up)
     factors = {"data": "Plaza2", "estimator": "GTSAM iSAM2"}
     outcome = run_recordings(Job("recordings", factors, 0, load_recordings_config()))
@@ -228,3 +230,31 @@ def test_shadowing_that_stays_with_the_place_is_not_averaged() -> None:
     assert few.beacons_m > many.beacons_m
     assert many.beacons_m > 2.0 * 5.0 * log(10.0) / (10.0 * cfg.path_loss.exponent)  # 2 m times the spread of ln r
     assert too_many is None
+
+
+def test_the_studies_take_the_recordings_of_ones_own_folder(tmp_path: Path) -> None:
+    w = world(seconds=60.0)
+    write_lines(tmp_path / "first.csv", csv_lines(w))
+    (tmp_path / "fleet").mkdir()
+    write_mrclam(tmp_path / "fleet", w, robot=2)
+    (tmp_path / "notes.md").write_text("nothing", encoding="utf-8")
+    assert {name: one.robots for name, one in sets_in(str(tmp_path)).items()} == {"first": (None,), "fleet": (2,)}
+    assert [*sets_in(str(tmp_path / "fleet"))] == ["fleet"]
+    cfg = load_recordings_config(None, {"run.data": str(tmp_path)})
+    study = RECORDINGS.of_config(RECORDINGS, cfg) if RECORDINGS.of_config else RECORDINGS
+    levels = [cell.factors for cell in study.cells()]
+    assert [one["data"] for one in levels] == ["first"] * 3 + ["fleet"] * 3
+    found = run_recordings(Job("recordings", levels[0], 0, cfg)).values
+    assert found["path_m"] < 0.3
+    damaged = run_damage(Job("damage", {"damage": "5 % ranges of 0 m"}, 0, cfg)).values
+    assert damaged["outcome"] == "recovered"
+    with pytest.raises(CampaignError, match="holds no recording"):
+        sets_in(str(tmp_path / "none"))
+
+
+def test_a_damage_that_needs_a_survey_is_impossible_without_one(tmp_path: Path) -> None:
+    lines = [line for line in csv_lines(world(seconds=60.0)) if not line.startswith("beacon")]
+    write_lines(tmp_path / "one.csv", lines)
+    cfg = load_recordings_config(None, {"run.data": str(tmp_path)})
+    factors = {"damage": "two beacons exchange names"}
+    assert run_damage(Job("damage", factors, 0, cfg)).values["outcome"] == "impossible"

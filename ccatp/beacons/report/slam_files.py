@@ -1,0 +1,65 @@
+"""The result of ``ccatp radio slam --out DIR`` as files: path, map, readings with innovations, factor graph."""
+
+import csv
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ccatp.beacons.config.models import RecordingConfig
+from ccatp.beacons.datasets.pyfg import pyfg_lines
+from ccatp.beacons.datasets.sheets import write_beacons
+from ccatp.beacons.datasets.tables import RadioDataError
+from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
+from ccatp.beacons.estimation.track_review import range_residuals
+from ccatp.core import FloatArray
+
+PATH = ("time_s", "x_m", "y_m", "heading_rad", "xx_m2", "xy_m2", "xh_m_rad", "yy_m2", "yh_m_rad", "hh_rad2")
+READINGS = (
+    "time_s", "beacon", "range_m", "bearing_rad", "rssi_dbm", "residual_m", "nis", "nis_size", "is_used",
+)  # fmt: skip
+FRAME = "of the first pose: that of the truth, or the origin"
+
+
+def write_slam(folder: Path, run: RecordedRun, track: EstimatedPath, assumed: RecordingConfig) -> None:
+    """Write ``path.csv``, ``map.toml`` with the joint covariance, ``readings.csv`` and ``graph.pyfg``.
+
+    A path of a fixed-lag smoother is in ``path_delayed.csv``, too. Raises RadioDataError: they cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write(folder / "path.csv", PATH, _path_rows(track.times_s, track.poses, track.covariances))
+        if (late := track.delayed) is not None:
+            _write(folder / "path_delayed.csv", PATH, _path_rows(late.times_s, late.poses, late.covariances))
+        _write(folder / "readings.csv", READINGS, _reading_rows(run, track, assumed.radio.camera_field_rad))
+        poses = np.column_stack([np.interp(run.steps.times_s, track.times_s, column) for column in track.poses.T])
+        graph = "\n".join(pyfg_lines(run, assumed, poses)) + "\n"
+        (folder / "graph.pyfg").write_text(graph, encoding="utf-8")
+    except OSError as error:
+        raise RadioDataError(error.filename or folder, f"cannot be written: {error.strerror or error}") from error
+    places_m = np.array([fix[:2] for fix in track.beacons.values()], dtype=np.float64).reshape(-1, 2)
+    write_beacons(folder / "map.toml", list(track.beacons), places_m, track.map_covariance, FRAME)
+
+
+def _write(file: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(head)
+        writer.writerows(rows)
+
+
+def _path_rows(times_s: FloatArray, poses: FloatArray, covariances: FloatArray) -> list[list[float]]:
+    upper = covariances[:, *np.triu_indices(3)]
+    rows: list[list[float]] = np.column_stack([times_s, poses, upper]).tolist()
+    return rows
+
+
+def _reading_rows(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -> Iterable[list[object]]:
+    """Residuals are those of the final path and map; innovations are those before each update. Empty: there is none."""
+    residuals = range_residuals(run, track, camera_field_rad)
+    found = {(one.time_s, one.beacon): one for one in track.innovations}
+    for row, (time_s, beacon, *values) in enumerate(zip(*(column.tolist() for column in run.readings), strict=True)):
+        name = run.beacon_ids[beacon]
+        one = found.get((time_s, name))
+        numbers = ["" if np.isnan(value) else value for value in (*values, float(residuals[row]))]
+        yield [time_s, name, *numbers, *(("", "", "") if one is None else (one.nis, one.size, int(one.is_used)))]

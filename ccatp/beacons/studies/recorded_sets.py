@@ -1,0 +1,111 @@
+"""The recordings of the studies, shipped or in a folder of one's own: their runs, and parts of runs."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.beacons.datasets.assembly import checked_run
+from ccatp.beacons.datasets.events import Recording, name_of
+from ccatp.beacons.datasets.formats import robots_in
+from ccatp.beacons.datasets.reader import found_format, read_run
+from ccatp.beacons.datasets.tables import RadioDataError, Table
+from ccatp.beacons.datasets.trajectory import pose_of_truth
+from ccatp.beacons.estimation.recording import RecordedRun, ReferencePath
+from ccatp.core import FloatArray
+from ccatp.studies.campaign import CampaignError
+
+
+class RecordedSet(NamedTuple):
+    """Path of a set in the folder of recordings, its robots, and for a bag the file of topics beside it."""
+
+    path: str
+    robots: tuple[int | None, ...] = (None,)
+    topics: str = ""
+
+
+SHIPPED = {
+    "Plaza2": RecordedSet("plaza/Plaza2_.mat"),
+    "MRCLAM 7": RecordedSet("mrclam/set7", (1, 2, 3, 4, 5)),
+    "Labyrinth": RecordedSet("uwb_labyrinth/labyrinth_0_600s.txt.gz"),
+    "MRCLAM 3": RecordedSet("mrclam/set3", (3, 5)),
+    "UWB Jackal": RecordedSet("uwb_jackal/jackal_complex_tag_p.csv.gz"),
+}
+
+
+@cache
+def sets_in(folder: str) -> Mapping[str, RecordedSet]:
+    """Sets by name: those of ``SHIPPED`` that the folder holds, or else every recording in it that can be read.
+
+    The folder may also be one set, or a file. A bag needs its topics in NAME.toml beside it. Raises CampaignError: no
+    folder is given, or it holds no recording.
+    """
+    if not folder:
+        raise CampaignError("where the recordings are is not known; give --data DIR")
+    where = Path(folder)
+    if found := {name: one for name, one in SHIPPED.items() if (where / one.path).exists()}:
+        return found
+    reason = "no such file or folder"
+    for path in (where, *(sorted(where.iterdir()) if where.is_dir() else ())):
+        try:
+            form = found_format(path)
+        except (RadioDataError, OSError) as error:
+            reason = str(error) if path == where else reason
+            continue
+        robots = tuple(robots_in(path if path.is_dir() else path.parent)) if form == "mrclam" else (None,)
+        topics = path.with_name(f"{name_of(path)}.toml") if form == "bag" else None
+        own = RecordedSet(str(path.relative_to(where)), robots, str(topics) if topics and topics.is_file() else "")
+        if path == where:
+            return {name_of(path.resolve()): own}
+        found[name_of(path)] = own
+    if not found:
+        raise CampaignError(f"--data {folder}: holds no recording ({reason}); see docs/radio_data.md")
+    return found
+
+
+@cache
+def recorded_run(folder: str, name: str, robot: int | None) -> RecordedRun:
+    """One run of a set. Raises CampaignError: no folder is given. Raises RadioDataError: the set does not exist."""
+    one = sets_in(folder)[name]
+    return read_run(Path(folder) / one.path, None, robot, Path(one.topics) if one.topics else None)
+
+
+@cache
+def recorded_window(folder: str, name: str, robot: int | None, begin_s: float, length_s: float) -> RecordedRun:
+    """A part of a run, times in s from the beginning of the run; its first pose is from the truth, if there is one.
+
+    The checks of the reader do not use the truth.
+    """
+    run = recorded_run(folder, name, robot)
+    tables, truth = events_of(run, begin_s, begin_s + length_s)
+    return read_again(run, tables, truth)
+
+
+def events_of(run: RecordedRun, begin_s: float, end_s: float) -> tuple[dict[str, Table], ReferencePath | None]:
+    """The recorded events of a part of a run, as tables of our CSV format, and the truth of that part."""
+    start_s = run.steps.times_s[0]
+
+    def table(*columns: FloatArray) -> Table:
+        values = np.column_stack(columns)
+        inside = (values[:, 0] >= start_s + begin_s) & (values[:, 0] <= start_s + end_s)
+        return Table(Path(run.name), values[inside], np.flatnonzero(inside) + 1)
+
+    steps, readings, known = run.steps, run.readings, np.isfinite
+    moves = (np.concatenate([[0.0], column]) for column in (steps.distance_m, steps.turn_rad, steps.lateral_m))
+    tables = {"odom": table(steps.times_s, *moves)}
+    for kind, column in zip(("range", "bearing", "rssi"), readings[2:], strict=True):
+        there = known(column)
+        if there.any():
+            tables[kind] = table(readings.times_s[there], readings.beacon[there].astype(float), column[there])
+    truth = None if run.truth is None else ReferencePath(*table(*run.truth).values.T)
+    return tables, truth
+
+
+def read_again(run: RecordedRun, tables: Mapping[str, Table], truth: ReferencePath | None) -> RecordedRun:
+    """A run from tables of events, as read and checked by the reader without the truth, which is added afterwards."""
+    again = checked_run(Recording(Path(run.name), run.name, run.kind, tables, run.beacon_ids))
+    pose = pose_of_truth(truth, again.steps, [])
+    return replace(again, first_pose=pose, truth=truth, beacon_truth_m=run.beacon_truth_m)
