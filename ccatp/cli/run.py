@@ -54,6 +54,12 @@ def run(
         raise click.UsageError("--start-held needs --resume; --resume-last always starts held")
     if recover and (resume or run_dir is not None):
         raise click.UsageError("--resume-last finds the run itself: leave out --resume and --run-dir")
+    from ccatp.daemon.supervision.fork_server import ForkServer
+    from ccatp.daemon.supervision.open_files import permit_open_files
+
+    permit_open_files()
+    # From here on it imports at the same time as this process.
+    fork_server = click.get_current_context().with_resource(ForkServer())
     from ccatp.daemon.supervision.run_dir import RunOptions, find_unfinished
 
     if resume and run_dir is None:
@@ -73,7 +79,7 @@ def run(
         held=held, recover=recover, json_output=json_output, runtime_dir=runtime_dir, faults_file=faults_file,
         verbosity=verbose - quiet,
     )  # fmt: skip
-    return int(run_to_the_end(options))
+    return int(run_to_the_end(options, fork_server))
 
 
 @common.command(

@@ -6,6 +6,8 @@ import socket
 from collections.abc import Mapping, MutableMapping
 
 SOCKET, WATCHDOG_USEC, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
+# For one process; its children must not use them.
+VARIABLES = SOCKET, WATCHDOG_USEC, WATCHDOG_PID
 
 
 class Notifier:
@@ -45,8 +47,8 @@ def is_journal(descriptor: int, environ: Mapping[str, str]) -> bool:
 
 
 def take_from(environ: MutableMapping[str, str]) -> tuple[Notifier, float | None]:
-    """Notifier and watchdog period; their variables are removed, because the children must not use them."""
+    """Notifier and watchdog period; their variables are removed."""
     notifier, period_s = Notifier(environ.get(SOCKET, "")), watchdog_period_s(environ)
-    for name in (SOCKET, WATCHDOG_USEC, WATCHDOG_PID):
+    for name in VARIABLES:
         environ.pop(name, None)
     return notifier, period_s

@@ -10,6 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from ccatp.daemon.supervision.fork_server import MODULE
 from ccatp.daemon.supervision.run_dir import CHILDREN_LOCK
 from tests.faults.linking import Measured
 from tests.processes.conftest import Start
@@ -174,7 +175,9 @@ def test_a_service_that_is_restarted_refuses_what_is_damaged_and_waits_for_an_op
     run = start("--panels", "1")
     run.until(lambda status: status["done"] >= 2)
     orphans = psutil.Process(run.process.pid).children()
-    for orphan in orphans:  # a next run waits for them
+    loops = [orphan for orphan in orphans if MODULE not in orphan.cmdline()]
+    assert len(loops) == len(orphans) - 1
+    for orphan in loops:  # a next run waits for them
         held = {Path(file.path) for file in orphan.open_files()}
         assert {folder / CHILDREN_LOCK for folder in (run.run_dir, run.runtime_dir)} <= held
     run.process.kill()
@@ -212,9 +215,11 @@ def test_a_service_that_is_restarted_refuses_what_is_damaged_and_waits_for_an_op
     time.sleep(0.3)
     assert again.ask("status")["status"]["done"] == done
     assert again.ask("resume")["ok"]
-    assert again.wait() == 0, again.stderr
+    again.until(lambda status: status["done"] >= done + 2)
+    assert again.ask("stop")["ok"]
+    assert again.wait() == 4, again.stderr
     assert "summary.json: cannot be written" in again.stderr
     assert "Traceback" not in again.stderr
     assert json.dumps(again.summary) == unchanged
     assert json.loads(again.stdout)["danger"]["falls"] == 0
-    assert again.measured == len(again.fixes) == len(set(again.fixes)) == 9
+    assert again.measured == len(again.fixes) == len(set(again.fixes)) >= done + 2

@@ -17,6 +17,7 @@ import psutil
 import pytest
 
 from ccatp.config.load import load_config
+from ccatp.daemon.supervision.supervisor import PROCESSES
 from ccatp.links.topics import TOPICS
 from ccatp.records.recorder import iter_messages
 from tests.processes.conftest import Start
@@ -138,7 +139,7 @@ def test_bad_peers_and_second_runs_are_refused_and_a_lockstep_pause_stops_no_eme
     assert run.summary["danger"] == SOUND
 
 
-def test_two_simulations_from_one_directory_have_five_processes_each_and_two_interrupts_end_them_as_one(
+def test_two_simulations_from_one_directory_have_their_own_processes_and_two_interrupts_end_them_as_one(
     tmp_path: Path, runtime_dir: Path
 ) -> None:
     env = os.environ | NO_REPORT | {"CCATP_RUNTIME_DIR": str(runtime_dir)}
@@ -153,7 +154,7 @@ def test_two_simulations_from_one_directory_have_five_processes_each_and_two_int
     for run in runs:
         children = [" ".join(child.cmdline()) for child in psutil.Process(run.pid).children()]
         modules = re.findall(r"ccatp\.daemon\.\w+\.(\w+)", " ".join(children))
-        assert sorted(modules) == ["danger_loop", "dashboard", "main_loop", "sim_etalon", "sim_robot"]
+        assert sorted(modules) == ["danger_loop", "dashboard", "fork_server", "main_loop", "sim_etalon", "sim_robot"]
         run.send_signal(signal.SIGINT)
         run.send_signal(signal.SIGINT)
     reports = set()
@@ -362,15 +363,21 @@ print(json.dumps([status, [name for name in {HEAVY!r} if name in sys.modules]]))
     assert not result.stderr
 
 
-@pytest.mark.parametrize(
-    "process",
-    ["supervision.supervisor", "loops.danger_loop", "operator.dashboard", "loops.sim_robot", "loops.sim_etalon"],
-)
-def test_only_the_main_loop_imports_scipy(process: str) -> None:
+def test_only_the_main_loop_imports_scipy() -> None:
     """It takes a fifth of a second of each start, and of each restart of the process that watches the rim."""
-    code = f"import sys, ccatp.daemon.{process}; print('scipy' in sys.modules)"
+    modules = ["ccatp.daemon.supervision.supervisor", *(spec.module for spec in PROCESSES)]
+    code = f"""
+import importlib, sys
+for name in sorted({modules!r}, key=lambda name: "main_loop" in name):
+    importlib.import_module(name)
+    print(name, "scipy" in sys.modules)
+importlib.import_module("ccatp.daemon.loops.survey_runner")
+print("scipy" in sys.modules)
+"""
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert result.stdout == "False\n"
+    *others, runner = result.stdout.splitlines()
+    assert sorted(others) == sorted(f"{name} False" for name in modules)
+    assert runner == "True"
 
 
 def test_a_closed_pipe_is_no_traceback() -> None:

@@ -4,10 +4,9 @@ import errno
 import os
 import socket
 import subprocess
-import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
@@ -17,8 +16,8 @@ from typing import NamedTuple, Protocol, TypeVar
 from ccatp.config.load import load_mission
 from ccatp.config.mission import MissionConfig
 from ccatp.config.models import DashboardConfig, ProcessesConfig
-from ccatp.config.package import child_environment
-from ccatp.daemon.supervision.process import SUPERVISOR_PID, listen_at, run_dir_in
+from ccatp.daemon.supervision.fork_server import ChildProcess, start_module
+from ccatp.daemon.supervision.process import listen_at, run_dir_in
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import Heartbeat
 from ccatp.missions import kind_of
@@ -30,8 +29,6 @@ FINAL = (ExitStatus.USAGE, ExitStatus.UNREACHABLE)
 _SIGNALS = {2: "SIGINT", 3: "SIGQUIT", 6: "SIGABRT", 7: "SIGBUS", 9: "SIGKILL", 11: "SIGSEGV", 15: "SIGTERM"}
 # In a longer time between two polls the supervisor itself was blocked and received nothing.
 MAX_POLL_GAP_S = 0.2
-# The matrices are 4 x 4: threads of the linear algebra would only compete with the processes for the cores.
-ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 STOP_TIMEOUT_S = 4.0
 # Each process has at least this time to stop, even if others have used up the deadline.
 LEAST_STOP_S = 1.0
@@ -129,7 +126,7 @@ class SilenceWatch:
 @dataclass(slots=True)
 class _Child:
     spec: ProcessSpec
-    process: subprocess.Popen[bytes]
+    process: ChildProcess
     watch: SilenceWatch | None
     why_killed: str = ""
 
@@ -138,7 +135,8 @@ class ProcessManager:
     """The processes of one run.
 
     ``cfg``: time-outs and restart limits. ``command_of``: command line of a process (restarted or not), and the file
-    descriptors that it inherits. ``notify_operator``: called with level and text.
+    descriptors that it inherits. ``notify_operator``: called with level and text. ``start``: starts a module with
+    arguments and descriptors.
     """
 
     def __init__(
@@ -146,8 +144,10 @@ class ProcessManager:
         cfg: ProcessesConfig,
         command_of: Callable[[ProcessSpec, bool], tuple[list[str], tuple[int, ...]]],
         notify_operator: Callable[[str, str], None],
+        start: Callable[[str, Sequence[str], Sequence[int]], ChildProcess] = start_module,
     ) -> None:
         self._cfg = cfg
+        self._start = start
         self._command_of = command_of
         self._notify_operator = notify_operator
         self._policy = RestartPolicy(cfg.restart_limit, cfg.restart_window_s)
@@ -163,15 +163,7 @@ class ProcessManager:
     def start(self, spec: ProcessSpec, *, is_restarted: bool = False) -> None:
         """Start a process."""
         arguments, fds = self._command_of(spec, is_restarted)
-        # In its own session, so that Ctrl-C in the terminal reaches only the supervisor, which stops all in order.
-        process = subprocess.Popen(
-            [sys.executable, "-m", spec.module, *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=sys.stderr,
-            pass_fds=fds,
-            start_new_session=True,
-            env={**child_environment(os.environ), **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
-        )
+        process = self._start(spec.module, arguments, fds)
         # Set from here, so that it applies before the process loads its first module, and not relative to the present
         # niceness of the supervisor, which may have changed.
         with suppress(OSError):  # it has ended already, or we may not raise its priority

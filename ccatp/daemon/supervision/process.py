@@ -26,6 +26,7 @@ import zmq
 from ccatp.config.files import keep_traceback, read_input
 from ccatp.config.load import load_mission
 from ccatp.config.mission import MissionConfig
+from ccatp.daemon.supervision.fork_server import SUPERVISOR_PID
 from ccatp.errors import CcatpError
 
 PR_SET_PDEATHSIG = 1
@@ -36,8 +37,6 @@ FAULTS_FILE = "faults.toml"
 RUN_DIR_FILE = "run_dir"
 # In the runtime directory: host and port of robot, laser system and page of this run, as JSON.
 ADDRESSES_FILE = "addresses.json"
-# Environment variable with the supervisor's process number, for its children.
-SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
 
 # Flags of the command line of a process, and their fields in ``ProcessArgs``.
 FLAGS = {

@@ -2,13 +2,13 @@
 
 import json
 import os
-import resource
 import signal
 import socket
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -34,7 +34,9 @@ from ccatp.daemon.supervision.child_processes import (
     with_addresses,
 )
 from ccatp.daemon.supervision.collector import Collector
+from ccatp.daemon.supervision.fork_server import ChildProcess, ForkServer, start_module
 from ccatp.daemon.supervision.named_files import check_named_files
+from ccatp.daemon.supervision.open_files import permit_open_files
 from ccatp.daemon.supervision.process import (
     ADDRESSES_FILE,
     FAULTS_FILE,
@@ -68,8 +70,6 @@ from ccatp.survey.ending import ending_of
 # Period of the polls of messages and processes; waking up for each message would double the cost in lockstep.
 POLL_S = 0.02
 STDERR = 2  # file descriptor
-# Open files of one process: 32 clients of the page, sockets, recording, database. Most systems permit 1024.
-OPEN_FILES = 256
 # Time for alarm posts in progress at the end.
 WEBHOOK_PATIENCE_S = 0.5
 # Largest number of messages per poll, so that signals and dead processes are noticed in between.
@@ -151,7 +151,7 @@ class SupervisedRun:
     """The children of one run and the messages collected from them.
 
     ``sockets``: listening sockets of simulators and dashboard, by process name. ``started_s``: start of the run by the
-    monotonic clock.
+    monotonic clock. ``fork_server``: starts the children while it lives.
     """
 
     def __init__(
@@ -160,6 +160,7 @@ class SupervisedRun:
         run: RunContext,
         sockets: Mapping[str, socket.socket],
         page: PageSocket,
+        fork_server: ForkServer,
         started_s: float,
     ) -> None:
         self._options = options
@@ -169,7 +170,8 @@ class SupervisedRun:
         self._sockets = sockets
         self._page = page
         self._started_s = started_s
-        self._children = ProcessManager(cfg.processes, self._command_of, self._notify_operator)
+        self._fork_server = fork_server
+        self._children = ProcessManager(cfg.processes, self._command_of, self._notify_operator, self._start)
         self._is_interrupted = False
         self._failure = ""  # the death of a process that ended the run
         self._has_begun = False
@@ -274,6 +276,13 @@ class SupervisedRun:
         self._log.log(LEVELS[level], OPERATOR_MESSAGE, text=text)
         self._view.show_message(level, text)
 
+    def _start(self, module: str, arguments: Sequence[str], fds: Sequence[int]) -> ChildProcess:
+        """Fork a process, or start it without the server if that has died."""
+        child = self._fork_server.start(module, arguments, fds)
+        if child is None:
+            self._log.warning("fork_server_lost", module=module)
+        return child or start_module(module, arguments, fds)
+
     def _command_of(self, process: ProcessSpec, is_restarted: bool) -> tuple[list[str], tuple[int, ...]]:
         options = self._options
         arguments = ["--run-dir", str(self._run_dir), "--runtime-dir", str(self._context.endpoints.runtime_dir)]
@@ -292,17 +301,18 @@ class SupervisedRun:
         return [*arguments, "--listen-fd", str(fd)], (fd, *self._context.locks)
 
 
-def run(options: RunOptions) -> int:
+def run(options: RunOptions, fork_server: ForkServer | None = None) -> int:
     """Run the configured mission to its end; returns the exit status (``docs/operator.md``).
 
-    CcatpError: the run could not begin.
+    ``fork_server``: one that was started before. CcatpError: the run could not begin.
     """
     cfg = load_mission(options.config_file, dict(options.overrides), any_ports=options.sim)
     kind = kind_of(cfg)
     if kind.no_resume is not None and (options.resume or options.recover):
         flag = "--resume" if options.resume else "--resume-last"
         raise ConfigError(f"{flag}: a {kind.title} cannot be resumed, because {kind.no_resume}; start a new one")
-    return recover(options, cfg, _run) if options.recover else _run(options, cfg)
+    begin = partial(_run, fork_server=fork_server)
+    return recover(options, cfg, begin) if options.recover else begin(options, cfg)
 
 
 def run_survey(options: RunOptions) -> int:
@@ -310,7 +320,7 @@ def run_survey(options: RunOptions) -> int:
     return _run(options, load_config(options.config_file, dict(options.overrides), any_ports=options.sim))
 
 
-def _run(options: RunOptions, cfg: MissionConfig) -> int:
+def _run(options: RunOptions, cfg: MissionConfig, fork_server: ForkServer | None = None) -> int:
     options = with_origin(options)
     permit_open_files()
     kind = kind_of(cfg)
@@ -354,16 +364,8 @@ def _run(options: RunOptions, cfg: MissionConfig) -> int:
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_text(read_toml(options.faults_file), encoding="utf-8")
         context = RunContext(cfg, run_dir, Endpoints(runtime_dir), is_sim=options.sim, locks=locks)
-        return SupervisedRun(options, context, sockets, page, started_s=started_s).run()
-
-
-def permit_open_files() -> None:
-    """Raise the limit of open files, which the processes inherit; ConfigError: the system permits too few."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if 0 <= hard < OPEN_FILES:  # -1 is no limit
-        raise ConfigError(f"only {hard} files may be open, a run needs {OPEN_FILES}; raise the limit with ulimit -n")
-    if 0 <= soft < OPEN_FILES:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (OPEN_FILES, hard))
+        forks = fork_server or stack.enter_context(ForkServer())
+        return SupervisedRun(options, context, sockets, page, forks, started_s=started_s).run()
 
 
 def _addresses(cfg: MissionConfig) -> dict[str, dict[str, object]]:

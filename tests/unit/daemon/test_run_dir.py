@@ -233,7 +233,7 @@ def test_a_real_robot_keeps_the_walls_time(sim: bool, realtime: bool, is_paced: 
 def test_a_service_continues_with_the_run_that_did_not_finish(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[RunOptions] = []
 
-    def run_once(wanted: RunOptions, _cfg: Config) -> int:
+    def run_once(wanted: RunOptions, _cfg: Config, fork_server: None) -> int:
         asked.append(wanted)
         assert wanted.run_dir is not None
         wanted.run_dir.mkdir(parents=True, exist_ok=True)
