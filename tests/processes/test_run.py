@@ -374,7 +374,7 @@ for name in sorted({modules!r}, key=lambda name: "main_loop" in name):
 importlib.import_module("ccatp.daemon.loops.survey_runner")
 print("scipy" in sys.modules)
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=180, check=True)
     *others, runner = result.stdout.splitlines()
     assert sorted(others) == sorted(f"{name} False" for name in modules)
     assert runner == "True"

@@ -132,13 +132,19 @@ def test_too_few_open_files_are_refused(runtime_dir: Path, tmp_path: Path) -> No
 
 
 def test_a_full_device_as_output_and_few_open_files_at_first_do_not_matter(runtime_dir: Path, tmp_path: Path) -> None:
-    with Path("/dev/full").open("wb") as full:
-        run = subprocess.run(
-            command(runtime_dir, tmp_path / "run"), preexec_fn=lambda: limited(24, 4096), stdout=full,
-            stderr=subprocess.PIPE, env=os.environ | NO_REPORT, timeout=PATIENCE_S, check=False,
-        )  # fmt: skip
-    assert (run.returncode, logged_status(tmp_path / "run")) == (0, 0)
-    assert b"warning: standard output cannot be written: No space left on device; see summary.json\n" in run.stderr
+    run_dir = tmp_path / "run"
+    with (
+        Path("/dev/full").open("wb") as full,
+        subprocess.Popen(
+            ("bash", "-c", 'ulimit -Sn 24 && ulimit -Hn 4096 && exec "$@"', "bash", *command(runtime_dir, run_dir)),
+            stdout=full, stderr=subprocess.PIPE, env=os.environ | NO_REPORT,
+        ) as run,
+    ):  # fmt: skip
+        until(lambda: (run_dir / "log.jsonl").exists() and "driving" in (run_dir / "log.jsonl").read_text())
+        run.send_signal(signal.SIGINT)
+        _, said = run.communicate(timeout=PATIENCE_S)
+    assert (run.returncode, logged_status(run_dir)) == (130, 130)
+    assert b"warning: standard output cannot be written: No space left on device; see summary.json\n" in said
 
 
 def test_a_run_directory_that_is_deleted_during_the_start(runtime_dir: Path, tmp_path: Path) -> None:
