@@ -6,7 +6,10 @@ import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import Any, Self
 
 import msgspec
@@ -21,12 +24,14 @@ from ccatp.daemon.supervision.run_text import RunText, clock
 from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
-from ccatp.missions import kind_of
+from ccatp.missions import MissionKind, kind_of
 from ccatp.records.summary import format_table
 from ccatp.survey.ending import ending_text, read_ending
 from ccatp.survey.turn import is_under_way, turn_text
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
+# What draws the figures of a report; its own modules import it where they draw.
+DRAWING = ("ccatp.report.run_page", "matplotlib.figure", "matplotlib.backends.backend_svg")
 # Signals that end a run, or the writing of its report.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
@@ -154,6 +159,26 @@ class RunView:
         """Show where the report is, or why there is none; on standard error, to keep standard output pure JSON."""
         if not self._is_quiet:
             self._console.print(printable(f"report  {where}"), soft_wrap=True, markup=False)
+
+
+def import_drawing(kind: MissionKind) -> Thread | None:
+    """Begin to import what draws the report of a kind of mission; ``None``: it has no report.
+
+    For a run in lockstep, in which no frame can be late: the second that it takes passes while the robot drives.
+    """
+    part = kind.report
+    if part is None:
+        return None
+
+    def load() -> None:
+        with suppress(Exception):  # the report itself says what is missing
+            for module in DRAWING:
+                import_module(module)
+            part.get()
+
+    thread = Thread(target=load, name="import of the report", daemon=True)
+    thread.start()
+    return thread
 
 
 def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.FilteringBoundLogger) -> str:

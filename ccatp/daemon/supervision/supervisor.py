@@ -19,7 +19,7 @@ from ccatp.config.files import read_toml, write_durably
 from ccatp.config.load import dump_config, load_config, load_mission
 from ccatp.config.mission import MissionConfig
 from ccatp.daemon.operator.alarms import AlarmList
-from ccatp.daemon.operator.terminal import STOP_SIGNALS, RunView, write_run_report
+from ccatp.daemon.operator.terminal import STOP_SIGNALS, RunView, import_drawing, write_run_report
 from ccatp.daemon.operator.webhook import AlarmWebhook
 from ccatp.daemon.supervision.child_processes import (
     PageSocket,
@@ -251,7 +251,10 @@ class SupervisedRun:
             collector.collect(0, self._view, MAX_MESSAGES)
             self._webhook.update(collector.status)
             # From main's first frame on, the checkpoint is of this session. A main loop restarted before begins again.
-            self._has_begun |= collector.status is not None and collector.status.seq >= 0
+            if not self._has_begun and collector.status is not None and collector.status.seq >= 0:
+                self._has_begun = True
+                if self._options.shows_summary and not self._options.is_paced:
+                    import_drawing(kind_of(self._cfg))
             now_s = time.monotonic()
             self._service.update(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
             # A dead process is handled first, because the messages of the others are its consequence.

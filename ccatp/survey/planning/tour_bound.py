@@ -6,8 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
-from scipy.sparse import csr_array, vstack
 
 from ccatp.config.models import LimitsConfig
 from ccatp.core import FloatArray, IntArray, PointId
@@ -132,6 +130,10 @@ def _priced(choices: _Choices) -> float:
 
     Constraints: one choice per place; both ends of a leg choose it equally; the tour has one end (last row).
     """
+    # A fifth of a second, and a run needs no bound.
+    from scipy.optimize import linprog  # noqa: PLC0415
+    from scipy.sparse import csr_array, vstack  # noqa: PLC0415
+
     places, m = int(choices.place[-1]) + 1, len(choices.cost_s)
     row, side = np.nonzero(choices.near != _NONE)
     own, other = choices.place[row], choices.near[row, side]
