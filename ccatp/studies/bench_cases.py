@@ -53,18 +53,18 @@ class Race(NamedTuple):
 
 def races(cfg: Config) -> Iterator[Race]:
     """Steps of filters, the races of the kinds of missions, and multilateration."""
-    # kf: the inertial unit, with none, one and ten samples of each wheel. ekf: the models as matrices. In the last case
-    # wheel angles are as exact as the localizer assumes for a rate encoder, as in most updates of a survey.
+    # kf: the inertial unit, with none, one and ten samples of each wheel. ekf: the models as matrices, but for the last
+    # case. In the one before, wheel angles are as exact as the localizer assumes for a rate encoder, as mostly.
     problems = [("kf", thesis_problem(cfg, m), "") for m in (2, 4, 22)]
     problems += [("ekf", linearised_problem(cfg, m), "") for m in (4, 6, 23)]
     problems += [("ekf", linearised_problem(cfg, 4, WheelAngle().variance_rad2()), ", angles to 1e-5 rad")]
-    problems += [("ukf", survey_problem(cfg), "")]
+    problems += [("ekf", survey_problem(cfg), ", its models evaluated"), ("ukf", survey_problem(cfg), "")]
     for filter_name, problem, detail in problems:
         name = f"{filter_name} predict + update, n = {problem.mean.size}, m = {problem.variances.size}{detail}"
         peers: dict[str, Contender]
-        peers = {"filterpy": partial(filterpy, problem), "Stone Soup": partial(stonesoup, problem)}
-        if filter_name != "ukf":
-            peers = {"eq. 2.13 in numpy": partial(printed_filter, problem), **peers}
+        peers = {"eq. 2.13 in numpy": partial(printed_filter, problem)} if filter_name != "ukf" else {}
+        if filter_name == "ukf" or isinstance(problem.F, np.ndarray):
+            peers |= {"filterpy": partial(filterpy, problem), "Stone Soup": partial(stonesoup, problem)}
         yield Race(name, partial(our_filter, filter_name, problem), peers)
     for kind in built_in():
         if kind.races is not None:
@@ -187,16 +187,22 @@ def our_filter(name: str, problem: FilterProblem) -> Solution:
 
 def printed_filter(problem: FilterProblem) -> Solution:
     """Thesis eq. 2.13 as printed, with an inverse and (I - W H) P, in numpy without checks."""
-    x, P, F, H, Q, variances, readings = problem
+    x, P, motion, sight, Q, variances, readings = problem
     R, identity = np.diag(variances), np.eye(x.size)
     yield tuple
     for z in readings:
-        x = F @ x
+        x, F = _linearised(motion, x)
         P = F @ P @ F.T + Q
+        h, H = _linearised(sight, x)
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-        x = x + K @ (z - H @ x)
+        x = x + K @ (z - h)
         P = (identity - K @ H) @ P
         yield x, P
+
+
+def _linearised(model: Any, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Image of x (n,) and the Jacobian, of a matrix or of a nonlinear model."""
+    return (model @ x, model) if isinstance(model, np.ndarray) else model.at(x)
 
 
 def _sigma_points(problem: FilterProblem) -> dict[str, float]:
