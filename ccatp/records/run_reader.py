@@ -331,16 +331,21 @@ def open_recordings(path: Path) -> list[Recording]:
     return with_frames
 
 
-def _open(path: Path) -> Recording:
-    metadata = _readable(path, read_metadata)
-    if not metadata:
-        raise RunReadError(f"{path}: no recording of a run; name a telemetry.mcap, or the directory of a run")
+def check_format(path: Path, metadata: Mapping[str, str]) -> None:
+    """Raises ``RunReadError``: a newer version wrote the recording, and this one would misunderstand it."""
     number = metadata.get("format", "0")
     if not number.isdecimal() or int(number) > RECORD_FORMAT:
         raise RunReadError(
             f"{path}: recorded in format {number} by ccatp {metadata.get('ccatp', 'unknown')}, this one reads "
-            f"up to {RECORD_FORMAT}: replay it with a newer ccatp"
+            f"up to {RECORD_FORMAT}: read it with a newer ccatp"
         )
+
+
+def _open(path: Path) -> Recording:
+    metadata = _readable(path, read_metadata)
+    if not metadata:
+        raise RunReadError(f"{path}: no recording of a run; name a telemetry.mcap, or the directory of a run")
+    check_format(path, metadata)
     if "config" not in metadata:
         check_run_dir(path.parent)
     return Recording(path, metadata)

@@ -22,7 +22,16 @@ from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.surface import MirrorError
 from ccatp.missions import SURVEY, MissionKind
 from ccatp.records.recorder import TELEMETRY, damage_text, decode_recorded, read_metadata, recordings
-from ccatp.records.run_reader import CONFIG, STORE, RunReadError, Trace, check_run_dir, read_truth, trace_of_truth
+from ccatp.records.run_reader import (
+    CONFIG,
+    STORE,
+    RunReadError,
+    Trace,
+    check_format,
+    check_run_dir,
+    read_truth,
+    trace_of_truth,
+)
 from ccatp.records.state_log import LogLine, StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint, StoreError, read_survey
 from ccatp.records.timeline import Timeline, first_of_each, iter_places, read_timeline
@@ -243,6 +252,7 @@ class RunFolder:
         lost = list[str]()
         try:
             metadata = read_metadata(path)
+            check_format(path, metadata)
             timeline = read_timeline(path, is_simulation=metadata.get("simulation") == "true")
             for place, topic, _, payload in iter_places(path):
                 if topic not in found:

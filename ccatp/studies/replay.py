@@ -306,7 +306,7 @@ class ReplayErrors(NamedTuple):
     turn_rad: FloatArray  # of the heading, in (-pi, pi]
     is_moving: NDArray[np.bool_]  # the wheels turn
     is_arrival: NDArray[np.bool_]  # the robot has just come to rest at a point for the first time
-    nees: FloatArray  # of x, y and heading: mean 3 if the covariance is right; NaN without a covariance
+    nees: FloatArray  # of x, y and heading, docs/glossary.md: 3 is expected; NaN without a covariance
 
 
 def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: ArrayLike) -> ReplayErrors:
@@ -329,14 +329,19 @@ def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: Arr
 def figures(errors: ReplayErrors) -> dict[str, Any]:
     """Statistics of errors: lengths in mm, angles in mrad; None without values."""
     distance_mm = 1e3 * errors.distance_m
-    known = errors.nees[np.isfinite(errors.nees)]
     return {
         "position_error_mm": {**distribution(distance_mm, _FIGURES, decimals=_DECIMALS), "rms": rms(distance_mm)},
         "moving_error_mm": {"rms": rms(distance_mm[errors.is_moving])},
         "arrival_error_mm": _rms_and_max(distance_mm[errors.is_arrival]),
         "heading_error_mrad": {"rms": rms(1e3 * errors.turn_rad)},
-        "nees_mean": float(known.mean()) if known.size else None,
+        "nees_mean": _mean(errors.nees),
+        "arrival_nees_mean": _mean(errors.nees[errors.is_arrival]),
     }
+
+
+def _mean(values: FloatArray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else None
 
 
 def difference(errors: ReplayErrors) -> dict[str, Any]:

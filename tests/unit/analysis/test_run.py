@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 import ccatp
 from ccatp.analysis.run import Run
@@ -15,6 +17,8 @@ from ccatp.analysis.table import Table
 from ccatp.beacons.analysis import BeaconRun
 from ccatp.core import PanelId
 from ccatp.daemon.operator.alarms import ALARMS_FILE
+from ccatp.links.runtime_dir import locked
+from ccatp.records.recorder import RUN_LOCK, read_metadata
 from ccatp.records.run_reader import RunReadError, open_recordings
 from tests.support.recorded import FRAMES, OFF_M, record, record_beacons
 
@@ -147,6 +151,63 @@ def test_a_run_in_progress_or_without_some_files_opens_and_says_what_is_missing(
     assert len(run.track()) == 0
     with pytest.raises(RunReadError, match=r"no telemetry\.mcap there, so no samples"):
         run.samples("imu")
+
+
+def test_a_run_that_goes_on_opens_and_its_recorder_is_not_disturbed(recorded: Path, spoilt: Path) -> None:
+    (spoilt / "summary.json").unlink()
+    data = (recorded / "telemetry.mcap").read_bytes()
+    (spoilt / "telemetry.mcap").unlink()
+    (spoilt / "telemetry.mcap").write_bytes(data[: 2 * len(data) // 3])  # without index, in the middle of a chunk
+    before = {file.name: file.read_bytes() for file in spoilt.iterdir()}
+    with locked(spoilt / RUN_LOCK, "held by another"):
+        run = ccatp.open_run(spoilt)
+        assert isinstance(run, SurveyRun)
+        assert len(run.fixes) == 9
+        assert 0 < len(run.track()) < len(ccatp.open_run(recorded).track())
+        assert run.summary is None
+        assert any("telemetry.mcap: still being written" in line for line in run.warnings)
+    assert {file.name: file.read_bytes() for file in spoilt.iterdir() if file.name in before} == before
+
+
+def rewritten(recording: Path, out: Path, metadata: dict[str, str], texts: dict[bytes, bytes]) -> None:
+    """A recording with other metadata and texts, and the robot's clock for both times, as up to format 2."""
+    with recording.open("rb") as file, out.open("wb") as copy:
+        reader, writer = make_reader(file), Writer(copy)
+        writer.start()
+        writer.add_metadata("ccatp", metadata)
+        channels: dict[str, int] = {}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.topic not in channels:
+                assert schema is not None
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            data, t_ns = message.data, message.publish_time
+            for present, old in texts.items():
+                data = data.replace(present, old)
+            writer.add_message(channels[channel.topic], log_time=t_ns, data=data, publish_time=t_ns)
+        writer.finish()
+
+
+OLD_TEXTS = {b'"missed_deadlines":': b'"slips":', b'"worst_lateness_ms":': b'"lag_ms":'}
+
+
+def test_a_run_of_an_older_format_has_the_same_tables(recorded: Path, spoilt: Path) -> None:
+    (spoilt / "telemetry.mcap").unlink()
+    metadata = {**read_metadata(recorded / "telemetry.mcap"), "format": "2"}
+    rewritten(recorded / "telemetry.mcap", spoilt / "telemetry.mcap", metadata, OLD_TEXTS)
+    old, new = ccatp.open_run(spoilt), ccatp.open_run(recorded)
+    assert isinstance(old, SurveyRun)
+    assert isinstance(new, SurveyRun)
+    assert old.track().tobytes() == new.track().tobytes()
+    assert old.samples("imu").tobytes() == new.samples("imu").tobytes()
+    assert list(old.points["first_arrival_mm"]) == list(new.points["first_arrival_mm"])
+
+
+def test_a_recording_of_a_newer_format_is_refused_in_one_line(recorded: Path, spoilt: Path) -> None:
+    (spoilt / "telemetry.mcap").unlink()
+    rewritten(recorded / "telemetry.mcap", spoilt / "telemetry.mcap", {"format": "99", "ccatp": "9.9"}, {})
+    with pytest.raises(RunReadError, match=r"recorded in format 99 by ccatp 9\.9, .*: read it with a newer ccatp"):
+        ccatp.open_run(spoilt)
 
 
 def test_a_damaged_recording_gives_what_is_left(recorded: Path, spoilt: Path) -> None:
