@@ -380,6 +380,9 @@ def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
     references = [part.truth if has_truth and part.truth is not None else part.recorded for part in parts]
     smoothed = [part.replayed.smoothed for part in parts if part.replayed.smoothed is not None]
 
+    if not has_truth:  # the difference from another estimate says nothing about a covariance
+        replayed, smoothed = ([one._replace(covariance=None) for one in part] for part in (replayed, smoothed))
+
     def errors(estimates: Sequence[Trace], references: Sequence[Trace]) -> ReplayErrors:
         each = [
             errors_of(estimate, reference, part.replayed.moving, part.arrivals)

@@ -185,7 +185,7 @@ def rewritten(recording: Path, out: Path, metadata: dict[str, str], texts: dict[
             for present, old in texts.items():
                 data = data.replace(present, old)
             writer.add_message(channels[channel.topic], log_time=t_ns, data=data, publish_time=t_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 OLD_TEXTS = {b'"missed_deadlines":': b'"slips":', b'"worst_lateness_ms":': b'"lag_ms":'}

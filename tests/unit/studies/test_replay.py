@@ -378,12 +378,16 @@ def test_the_table_has_a_column_for_each_estimate() -> None:
     lines = [" ".join(line.split()) for line in table_lines(judge([judged(has_truth=True)]))]
     assert lines[0] == "error against the truth recorded replayed smoothed"
     assert lines[1] == "position mean (mm) 3.0000 2.0000 0.5000"
-    assert lines[-2] == "position (mm) 1.4142 2.0000"
+    assert lines[-3] == "position (mm) 1.4142 2.0000"
     assert "at arrivals rms (mm) - - -" in lines
+    assert "NEES, all frames (3 expected) - 4.0e-06 -" in lines
+    assert "NEES at arrivals (3 expected) - - -" in lines
+    assert lines[-1].startswith("NEES below 3: the errors are smaller than their covariance says")
     lines = [" ".join(line.split()) for line in table_lines(judge([judged(has_truth=False, is_smoothed=False)]))]
     assert lines[:2] == ["error against the recorded estimate recorded replayed", "position mean (mm) - 1.0000"]
+    assert "NEES" not in "".join(lines)
     part = judged(has_truth=True)._replace(recorded=trace([0.002, 0.002 + 3e-14]))
-    assert list(table_lines(judge([part])))[-2].split()[-1] == "3.0e-11"
+    assert list(table_lines(judge([part])))[-3].split()[-1] == "3.0e-11"
 
 
 def test_the_rows_of_the_csv() -> None:
