@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import numpy.typing as npt
 
+from ccatp.beacons.datasets.trajectory import CONSTANT_RAD, STRAIGHT
 from ccatp.beacons.estimation.recording import BoolArray, Readings, RecordedRun, ReferencePath, Steps, dead_reckoned
 from ccatp.core import FloatArray, IntArray
 
@@ -41,6 +42,7 @@ def inconsistencies(run: RecordedRun) -> Iterator[str]:
     """Warnings about units and clocks that need no truth, and of a truth with another clock than the odometry."""
     rare = list(_rare(run.steps))
     yield from rare
+    yield from _unturning(run.steps)
     if rare:
         return
     path = dead_reckoned(run.steps, (0.0, 0.0, 0.0))
@@ -65,6 +67,19 @@ def _rare(steps: Steps) -> Iterator[str]:
         yield (
             f"odometry comes every {usual_s:.3g} s at {fast:.2g} m/s: are its times in milliseconds? Nothing was "
             "converted; give s"
+        )
+
+
+def _unturning(steps: Steps) -> Iterator[str]:
+    """Poses without a heading: the vehicle moves in all directions and never turns."""
+    moving = np.hypot(steps.distance_m, steps.lateral_m) > 0.0
+    course = np.arctan2(steps.lateral_m[moving], steps.distance_m[moving])
+    if np.abs(steps.turn_rad).max() >= CONSTANT_RAD or moving.sum() < FEWEST_PAIRS:
+        return
+    if abs(np.mean(np.exp(1j * course))) < STRAIGHT:
+        yield (
+            "the odometry never turns while its course does: its poses have no heading, so bearings and errors of "
+            "the heading mean nothing"
         )
 
 

@@ -5,7 +5,8 @@ Needs the extra ``ros`` (rosbags). It reads the message definitions in the bag, 
 
 import tomllib
 from collections.abc import Iterator
-from math import atan2, cos, sin
+from contextlib import closing
+from math import atan2
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,10 +14,11 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from ccatp.beacons.datasets.events import Recording, name_of
+from ccatp.beacons.datasets.placeholders import true_positions
 from ccatp.beacons.datasets.tables import RadioDataError, tables_of
+from ccatp.beacons.datasets.trajectory import motions_between
 from ccatp.config.files import read_input
 from ccatp.config.models import Model
-from ccatp.kinematics import wrap_pi
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _MOST_TOPICS_BYTES = 100_000
@@ -37,9 +39,12 @@ class ReadingsTopic(Model):
     each: str = ""  # field with the list of readings, if a message has several
     beacon: str = ""  # field with the name of the beacon,
     name: str = ""  # or the name itself, if all readings of the topic are of one beacon
+    tag: str = ""  # field with the name of the vehicle's radio,
+    of_tag: str = ""  # or the name itself, if all readings of the topic are of one radio
     range: str = ""
     bearing: str = ""
     rssi: str = ""
+    unit: Literal["m", "cm", "mm", "ft"] = "m"  # of the ranges
 
 
 class TruthTopic(Model):
@@ -48,14 +53,39 @@ class TruthTopic(Model):
     topic: str
 
 
+class MarkersTopic(Model):
+    """Surveyed beacons as markers, each with a pose; the last message of a beacon counts."""
+
+    topic: str
+    each: str = "markers"  # field with the list of markers; empty: a message is one marker
+    name: str = "id"  # field with the name of the beacon
+
+
 class Topics(Model):
     """The topics of a bag, and data that it lacks."""
 
     odometry: OdometryTopic
     readings: list[ReadingsTopic]
     truth: TruthTopic | None = None
+    markers: MarkersTopic | None = None
     antenna_m: _Place = (0.0, 0.0, 0.0)  # forward, left and up from the origin of the vehicle
+    tags: dict[str, _Place] = Field(default_factory=dict)  # the same of each of several radios
+    use_tag: str = ""  # the one that is used; empty: the one with most readings
     beacons: dict[str, _Place] = Field(default_factory=dict)
+
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+Row = tuple[str, int, list[float]]
+
+
+class _Found:
+    """What the messages of a bag have: rows by kind, names of beacons, readings by tag, surveyed places."""
+
+    def __init__(self) -> None:
+        self.numbers: dict[str, float] = {}
+        self.rows: list[Row] = []
+        self.by_tag: dict[str, list[Row]] = {}
+        self.places: dict[str, tuple[float, ...]] = {}
 
 
 def read_bag(path: Path, topics_file: Path | None) -> Recording:
@@ -64,15 +94,37 @@ def read_bag(path: Path, topics_file: Path | None) -> Recording:
     Raises RadioDataError: rosbags is not installed, or the bag or its topics are invalid.
     """
     if topics_file is None:
-        raise RadioDataError(path, "is a bag: give a TOML file that names its topics with --topics")
-    topics = read_topics(topics_file)
-    numbers: dict[str, float] = {}
-    rows = list(_rows(path, topics, numbers))
-    for name, place in topics.beacons.items():
-        rows.append(("beacon", 0, [_number(numbers, name), *place, *[np.nan] * (3 - len(place))]))
-    if any(topics.antenna_m):
-        rows.append(("antenna", 0, [*topics.antenna_m, *[0.0] * (3 - len(topics.antenna_m))]))
-    return Recording(path, name_of(path), "csv", tables_of(path, rows), tuple(numbers))
+        raise RadioDataError(
+            path, "is a bag: give a TOML file that names its topics with --topics; see docs/radio_data.md"
+        )
+    topics, warnings = read_topics(topics_file), list[str]()
+    found = _read(path, topics, warnings)
+    tag = _chosen_tag(path, topics, found, warnings)
+    rows = found.rows + found.by_tag.get(tag, [])
+    for name, place in {**found.places, **topics.beacons}.items():
+        rows.append(("beacon", 0, [_number(found.numbers, name), *place, *[np.nan] * (3 - len(place))]))
+    antenna_m = topics.tags.get(tag, topics.antenna_m)
+    if any(antenna_m):
+        rows.append(("antenna", 0, [*antenna_m, *[0.0] * (3 - len(antenna_m))]))
+    tables = tables_of(path, rows)
+    if (poses := tables.pop("pose", None)) is not None:
+        if np.isnan(poses.values[:, 3]).all():
+            raise RadioDataError(path, f"{topics.odometry.topic} has no orientations: no odometry comes from it")
+        tables["odom"] = motions_between(true_positions(poses, "odometry", warnings))
+    return Recording(path, name_of(path), "csv", tables, tuple(found.numbers), tuple(warnings))
+
+
+def _chosen_tag(path: Path, topics: Topics, found: _Found, warnings: list[str]) -> str:
+    counts = {tag: len(rows) for tag, rows in found.by_tag.items()}
+    tag = topics.use_tag or max(counts, key=lambda one: counts[one], default="")
+    if topics.use_tag and tag not in counts:
+        raise RadioDataError(path, f"has no reading of tag {tag}; there are {', '.join(counts) or 'none'}")
+    if tag and topics.tags and tag not in topics.tags:
+        warnings.append(f"the place of tag {tag} is not given: antenna_m is taken")
+    if len(counts) > 1:
+        others = ", ".join(f"{one} ({count})" for one, count in counts.items() if one != tag)
+        warnings.append(f"readings of tag {tag} are used, those of the tags {others} are not: use_tag chooses another")
+    return tag
 
 
 def read_topics(file: Path) -> Topics:
@@ -93,35 +145,63 @@ def _number(numbers: dict[str, float], name: str) -> float:
     return numbers.setdefault(name, float(len(numbers)))
 
 
-def _rows(path: Path, topics: Topics, numbers: dict[str, float]) -> Iterator[tuple[str, int, list[float]]]:
-    last: tuple[float, ...] = ()
+def _read(path: Path, topics: Topics, warnings: list[str]) -> _Found:
+    found = _Found()
     wanted = {topics.odometry.topic, *(one.topic for one in topics.readings)}
-    wanted |= {topics.truth.topic} if topics.truth else set()
-    for line, (topic, received_s, message) in enumerate(_messages(path, wanted), 1):
+    wanted |= {one.topic for one in (topics.truth, topics.markers) if one}
+    for line, (topic, received_s, message) in enumerate(_messages(path, wanted, warnings), 1):
         stamp = getattr(getattr(message, "header", None), "stamp", None)
         time_s = received_s if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
         try:
-            if topic == topics.odometry.topic:
-                now = time_s, *(_velocity(message) if topics.odometry.use == "twist" else _pose(message))
-                yield "odom", line, _moved(last or now, now, topics.odometry.use)
-                last = now
+            if topic == topics.odometry.topic and topics.odometry.use == "twist":
+                ahead, left, rate = _velocity(message)
+                found.rows.append(("speed", line, [time_s, ahead, rate, left]))
+            elif topic == topics.odometry.topic:
+                found.rows.append(("pose", line, [time_s, *_pose(message)]))
             if topics.truth is not None and topic == topics.truth.topic:
-                yield "truth", line, [time_s, *_pose(message)]
-            for one in topics.readings:
-                if one.topic == topic:
-                    yield from _readings(one, message, time_s, line, numbers)
+                found.rows.append(("truth", line, [time_s, *_pose(message)]))
+            if topics.markers is not None and topic == topics.markers.topic:
+                for one in _field(message, topics.markers.each) if topics.markers.each else [message]:
+                    place = one.pose.position
+                    found.places[str(_field(one, topics.markers.name))] = float(place.x), float(place.y), float(place.z)
+            for each in topics.readings:
+                if each.topic == topic:
+                    _take_readings(each, message, time_s, line, found)
         except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
             raise RadioDataError(path, f"message {line} of {topic} ({message.__msgtype__}): {error}") from error
+    return found
 
 
-def _messages(path: Path, wanted: set[str]) -> Iterator[tuple[str, float, Any]]:
+def _take_readings(topic: ReadingsTopic, message: Any, time_s: float, line: int, found: _Found) -> None:
+    for one in _field(message, topic.each) if topic.each else [message]:
+        name = topic.name or str(_field(one, topic.beacon))
+        tag = topic.of_tag or (str(_field(one, topic.tag)) if topic.tag else "")
+        for kind in ("range", "bearing", "rssi"):
+            if field := getattr(topic, kind):
+                value = float(_field(one, field)) * (UNITS[topic.unit] if kind == "range" else 1.0)
+                row = kind, line, [time_s, _number(found.numbers, name), value]
+                found.by_tag.setdefault(tag, []).append(row)
+
+
+def _messages(path: Path, wanted: set[str], warnings: list[str]) -> Iterator[tuple[str, float, Any]]:
     try:
-        from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
+        from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 - an extra
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError as error:
         raise RadioDataError(path, "is a bag: to read it, install ccatp with its extra, ccatp[ros]") from error
+    types = get_typestore(Stores.ROS2_JAZZY)
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        try:
+            reader = AnyReader([path], default_typestore=types)
+            reader.open()
+        except AnyReaderError:
+            if not (files := [path] if path.suffix == ".mcap" else sorted(path.glob("*.mcap"))):
+                raise
+            warnings.append("the bag has no index, as after a crash: its messages are read up to its end")
+            for file in files:
+                yield from _unindexed(file, wanted, types)
+            return
+        with closing(reader):
             if missing := sorted(wanted - {one.topic for one in reader.connections}):
                 there = ", ".join(sorted({one.topic for one in reader.connections}))
                 raise RadioDataError(path, f"has no topic {missing[0]}; there are {there}")
@@ -134,14 +214,22 @@ def _messages(path: Path, wanted: set[str]) -> Iterator[tuple[str, float, Any]]:
         raise RadioDataError(path, f"is no bag that can be read: {' '.join(str(error).split())[:200]}") from error
 
 
-def _readings(
-    topic: ReadingsTopic, message: Any, time_s: float, line: int, numbers: dict[str, float]
-) -> Iterator[tuple[str, int, list[float]]]:
-    for one in _field(message, topic.each) if topic.each else [message]:
-        name = topic.name or str(_field(one, topic.beacon))
-        for kind in ("range", "bearing", "rssi"):
-            if field := getattr(topic, kind):
-                yield kind, line, [time_s, _number(numbers, name), float(_field(one, field))]
+def _unindexed(file: Path, wanted: set[str], types: Any) -> Iterator[tuple[str, float, Any]]:
+    """Messages of an mcap file of ROS 2 from its beginning, up to where it was cut."""
+    from mcap.exceptions import EndOfFile  # noqa: PLC0415 -- only for such bags
+    from mcap.reader import NonSeekingReader  # noqa: PLC0415
+    from rosbags.typesys import get_types_from_msg  # noqa: PLC0415
+
+    with file.open("rb") as stream:
+        try:
+            for schema, channel, message in NonSeekingReader(stream).iter_messages([*wanted], log_time_order=False):
+                if schema is None:
+                    continue
+                if schema.name not in types.fielddefs:
+                    types.register(get_types_from_msg(schema.data.decode(), schema.name))
+                yield channel.topic, 1e-9 * message.log_time, types.deserialize_cdr(message.data, schema.name)
+        except EndOfFile:
+            return
 
 
 def _field(message: Any, path: str) -> Any:
@@ -166,15 +254,3 @@ def _velocity(message: Any) -> tuple[float, float, float]:
     for _ in range(2):
         message = getattr(message, "twist", message)
     return float(message.linear.x), float(message.linear.y), float(message.angular.z)
-
-
-def _moved(last: tuple[float, ...], now: tuple[float, ...], use: str) -> list[float]:
-    """A row of odometry: time; then motion forward, turn, and motion to the left since the previous message."""
-    before_s, *before = last
-    time_s, *values = now
-    if use == "twist":
-        ahead, left, rate = (value * (time_s - before_s) for value in before)
-        return [time_s, ahead, rate, left]
-    turn_rad = wrap_pi(values[2] - before[2])
-    dx, dy, middle = values[0] - before[0], values[1] - before[1], before[2] + 0.5 * turn_rad
-    return [time_s, cos(middle) * dx + sin(middle) * dy, turn_rad, cos(middle) * dy - sin(middle) * dx]

@@ -34,8 +34,11 @@ topic = "/truth"
 """
 
 
-def write_bag(path: Path, w: World) -> Path:
-    """Odometry and truth as nav_msgs/Odometry, ranges as sensor_msgs/Range."""
+def write_bag(path: Path, w: World, tags: int = 1, unit_m: float = 1.0) -> Path:
+    """Odometry and truth as nav_msgs/Odometry, ranges as sensor_msgs/Range, places of beacons as PoseStamped.
+
+    The tag of a range is in ``radiation_type``; the tags alternate: the first has the readings 0, ``tags``, ...
+    """
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -66,9 +69,17 @@ def write_bag(path: Path, w: World) -> Path:
     ]
     names = list(BEACONS)
     fields: tuple[Any, ...] = () if path.suffix == ".bag" else (0.0,)  # ROS 2 has a variance, too
-    for t, beacon, range_m in zip(w.read_s, w.read_beacon, w.range_m, strict=True):
-        message = kinds["sensor_msgs/msg/Range"](header(t, names[beacon]), 0, 0.1, 0.0, 50.0, range_m, *fields)
+    for k, (t, beacon, range_m) in enumerate(zip(w.read_s, w.read_beacon, w.range_m, strict=True)):
+        values = header(t, names[beacon]), k % tags, 0.1, 0.0, 50.0, range_m / unit_m, *fields
+        message = kinds["sensor_msgs/msg/Range"](*values)
         rows.append((t, "/uwb", message))
+    for name, (x, y) in BEACONS.items():
+        place = kinds["geometry_msgs/msg/Point"](x, y, 0.0)
+        turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        stamped = kinds["geometry_msgs/msg/PoseStamped"](
+            header(0.5, name), kinds["geometry_msgs/msg/Pose"](place, turn)
+        )
+        rows.append((0.5, "/anchors", stamped))
     plugin = {".db3": StoragePlugin.SQLITE3, ".mcap": StoragePlugin.MCAP}.get(path.suffix)
     folder = path.with_suffix("") if plugin else path
     with Writer1(path) if plugin is None else Writer(folder, version=9, storage_plugin=plugin) as writer:
@@ -102,7 +113,7 @@ def test_a_bag_is_the_run_that_its_csv_is(suffix: str, tmp_path: Path) -> None:
     [
         ("", "odometry: field required"),
         ("[odometry", "is no TOML"),
-        (TOPICS.replace("/uwb", "/nothing"), "has no topic /nothing; there are /odom, /truth, /uwb"),
+        (TOPICS.replace("/uwb", "/nothing"), "has no topic /nothing; there are /anchors, /odom, /truth, /uwb"),
         (TOPICS.replace('"range"', '"distance"'), "message 5 of /uwb"),
     ],
 )
@@ -114,6 +125,43 @@ def test_topics_that_are_not_there(topics: str, what: str, tmp_path: Path) -> No
         read_run(bag, None, None, file)
     with pytest.raises(RadioDataError, match="names its topics with --topics"):
         read_run(bag, None, None)
+
+
+MORE = """
+[markers]
+topic = "/anchors"
+each = ""
+name = "header.frame_id"
+"""
+
+
+@pytest.mark.parametrize(("use", "kept"), [("", 0), ('use_tag = "1"', 1)])
+def test_one_of_several_tags_in_millimetres_and_beacons_from_markers(use: str, kept: int, tmp_path: Path) -> None:
+    w = world(seconds=20.0)
+    topics = tmp_path / "topics.toml"
+    tags = 'tag = "radiation_type"\nunit = "mm"'
+    arms = "\n[tags]\n0 = [0.3, 0.0]\n1 = [0.0, 0.2]\n"
+    topics.write_text(use + TOPICS.replace('range = "range"', f'range = "range"\n{tags}') + MORE + arms)
+    found = read_run(write_bag(tmp_path / "run.mcap", w, tags=2, unit_m=1e-3), None, None, topics)
+    np.testing.assert_allclose(np.sort(found.readings.range_m), np.sort(w.range_m[kept::2]), atol=1e-5)
+    assert found.antenna_m == ((0.3, 0.0), (0.0, 0.2))[kept]
+    assert dict(found.beacon_truth_m) == BEACONS
+    assert f"readings of tag {kept} are used, those of the tags {1 - kept} (" in " | ".join(found.warnings)
+    topics.write_text('use_tag = "7"' + topics.read_text().removeprefix(use))
+    with pytest.raises(RadioDataError, match="has no reading of tag 7; there are 0, 1"):
+        read_run(tmp_path / "run" / "run.mcap", None, None, topics)
+
+
+def test_a_bag_without_its_index_is_read(tmp_path: Path) -> None:
+    w = world(seconds=20.0)
+    (topics := tmp_path / "topics.toml").write_text(TOPICS)
+    whole = write_bag(tmp_path / "run.mcap", w)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:-1000])  # of its summary
+    found = read_run(cut, None, None, topics)
+    assert "the bag has no index" in " | ".join(found.warnings)
+    assert found.steps.times_s[-1] == pytest.approx(20.0)
+    np.testing.assert_allclose(found.first_pose, w.poses[0], atol=1e-5)
 
 
 ANTENNA_M, ABOVE_M = (0.8, -0.5), 2.0
