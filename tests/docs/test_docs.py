@@ -34,16 +34,9 @@ def blocks(path: Path, *languages: str) -> list[str]:
     return [body for language, body in FENCE.findall(path.read_text(encoding="utf-8")) if language in languages]
 
 
-def test_what_holds_the_robot_has_its_row_and_no_row_is_without_use() -> None:
+def test_no_two_conditions_have_the_same_text() -> None:
     rows = [shown(row.message) for row in OTHERS]
     assert len(rows) == len(set(rows))
-    folders = ("survey", "estimation", "daemon", "beacons", "control")
-    paths = [path for name in folders for path in (ROOT / "ccatp" / name).glob("**/*.py")]
-    paths = [path for path in paths if path.name != "conditions.py" and path.parent.name != "conditions"]  # rows
-    source = "\n".join(path.read_text(encoding="utf-8") for path in paths)
-    calls = r"\b(?:fault|hold|interrupt|abort|_request_hold|Fault|Interrupted|Abort)\((?:self, |s, )?"
-    texts = set(re.findall(calls + r'f?"([^"\n]*)"', source))
-    assert not texts, "rows for them in ccatp/conditions/, then make docs"
 
 
 PLACES = {  # where the owner of a condition finds it
@@ -103,17 +96,46 @@ def command_lines() -> Iterator[tuple[str, str]]:
                     yield path.stem, words
 
 
+def resolved(words: list[str], *, is_whole: bool = True) -> tuple[click.Context, list[str]]:
+    """The command that the words name, and the words after it. ``is_whole``: a group of commands is not enough."""
+    command: click.Command = cli
+    context = click.Context(cli, info_name="ccatp")
+    while isinstance(command, click.Group) and (is_whole or (words and not words[0].startswith("-"))):
+        name, found, words = command.resolve_command(context, words)
+        assert found is not None
+        command, context = found, click.Context(found, parent=context, info_name=name)
+    return context, words
+
+
 @pytest.mark.parametrize(("page", "line"), sorted(set(command_lines())))
 def test_command_lines_exist(page: str, line: str) -> None:
     shown = re.split(r" [|>] ", line)[0]
-    words = [EXAMPLES.get(word, word) for word in shlex.split(shown)[1:]]
-    command: click.Command = cli
-    context = click.Context(cli, info_name="ccatp")
-    while isinstance(command, click.Group):
-        name, command_found, words = command.resolve_command(context, words)
-        assert command_found is not None, line
-        command, context = command_found, click.Context(command_found, parent=context, info_name=name)
-    command.make_context(context.info_name, list(words), parent=context.parent)  # parses; runs nothing
+    context, words = resolved([EXAMPLES.get(word, word) for word in shlex.split(shown)[1:]])
+    context.command.make_context(context.info_name, list(words), parent=context.parent)  # parses; runs nothing
+
+
+INLINE = re.compile(r"`((?:\S*/)?ccatp [a-z][^`]*)`")
+
+
+def unknown_options(line: str) -> list[str]:
+    """Options that the named command does not have; click.UsageError: there is no such command."""
+    context, words = resolved(shlex.split(re.split(r" [|>] ", line)[0])[1:], is_whole=False)
+    known = {option for one in context.command.params for option in (*one.opts, *one.secondary_opts)}
+    given = [word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)]
+    return [option for option in given if option not in known | {"--help", "--version"}]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
+def test_commands_in_the_text_exist(path: Path) -> None:
+    lines = [" ".join(line.split()) for line in INLINE.findall(FENCE.sub("", path.read_text(encoding="utf-8")))]
+    assert {line: unknown for line in lines if (unknown := unknown_options(line))} == {}
+
+
+def test_a_command_in_the_text_that_does_not_exist_is_found() -> None:
+    assert unknown_options("ccatp plan --mirror NAME --orders") == ["--orders"]
+    assert unknown_options(".venv/bin/ccatp config check FILE") == []
+    with pytest.raises(click.UsageError, match="No such command 'plans'"):
+        unknown_options("ccatp plans --mirror NAME")
 
 
 @pytest.fixture(scope="module")
