@@ -15,6 +15,7 @@ from ccatp.errors import ConfigError, ExitStatus, UsageError
 
 if TYPE_CHECKING:
     from ccatp.config.models import Config
+    from ccatp.core import Measured
     from ccatp.records.run_reader import Recording
     from ccatp.studies.replay import ReplayEvaluation
 
@@ -99,28 +100,47 @@ def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: s
 @common.command(
     "ccatp align runs/tonight",
     "ccatp align runs/tonight --csv moves.csv --figure panels.png",
+    "ccatp align runs/tonight --with runs/evening",
     "ccatp align runs/tonight --json --set align.point_floor_m=2e-6",
 )
 @click.argument("run_dir", type=common.PATH)
+@click.option(
+    "--with",
+    "others",
+    type=common.PATH,
+    multiple=True,
+    metavar="RUN_DIR",
+    help="Another survey of the same night: the laser network is adjusted to the lengths of all.",
+)
 @common.settings_option("A key of align or mirror, or robot.puck_height_m, as in align.point_floor_m=2e-6.")
 @click.option("--csv", "csv_file", type=common.OutputFile(), help="Write a line a panel (CSV).")
 @common.figure_option("Draw deviations and moves")
 @common.JSON_OPTION
 def align(
-    run_dir: Path, settings: Mapping[str, object], csv_file: Path | None, figure_file: Path | None, json_output: bool
+    run_dir: Path,
+    others: tuple[Path, ...],
+    settings: Mapping[str, object],
+    csv_file: Path | None,
+    figure_file: Path | None,
+    json_output: bool,
 ) -> int:
-    """Show the alignment of the panels and the turns of their adjusters, from the fixes of a run."""
+    """Show the alignment of the panels and the moves of their adjusters, from the fixes of a run.
+
+    The laser network is adjusted to all lengths of the run first, and the panels are computed
+    with it.
+    """
     from ccatp.mirror.mirror import build_mirror
-    from ccatp.mirror.mirror_alignment import compare, survey_result
+    from ccatp.mirror.mirror_alignment import align_survey, compare
     from ccatp.records.run_reader import read_run
     from ccatp.report.alignment import result_data, table_lines
+    from ccatp.report.network import network_data, network_lines, remarks
 
     _check_effect(settings, ALIGN_KEYS, "the alignment")
     survey = read_run(run_dir, settings)
     cfg = survey.cfg
     mirror = build_mirror(cfg.mirror)
     planned = {point.panel for point in survey.planned}
-    result = survey_result(mirror, cfg.align, cfg.robot.puck_height_m, survey.measured, planned)
+    result, network = align_survey(cfg, mirror, survey.measured, planned, [_measured_with(one, cfg) for one in others])
     comparison = None if survey.injected is None else compare(result.panels, survey.injected)
     outliers = sum(len(panel.outliers) for panel in result.panels)
     facts = {
@@ -132,7 +152,7 @@ def align(
         "adjusters": list(result.panels[0].adjusters) if result.panels else [],
         "puck_height_sigma_um": round(cfg.align.puck_height_sigma_m * 1e6, 4),
     }
-    warnings = [*survey.warnings, *result.warnings]
+    warnings = [*survey.warnings, *remarks(network), *result.warnings]
     common.warn(warnings)
     if csv_file is not None:
         from ccatp.report.tables import csv_lines, panel_table
@@ -142,9 +162,21 @@ def align(
         from ccatp.report.mirror_map import draw_alignment
 
         draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
-    lines = table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m)
-    common.print_result({**facts, **result_data(result, comparison), "warnings": warnings}, lines, json_output)
+    lines = [*table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m), *network_lines(network)]
+    data = {**facts, **result_data(result, comparison), "network": network_data(network), "warnings": warnings}
+    common.print_result(data, lines, json_output)
     return 0
+
+
+def _measured_with(run_dir: Path, cfg: "Config") -> "Sequence[Measured]":
+    """The fixes of another survey by the same collimators."""
+    from ccatp.records.run_reader import read_run
+
+    other = read_run(run_dir, {})
+    for name in ("mirror", "etalon"):
+        if getattr(other.cfg, name) != getattr(cfg, name):
+            raise UsageError(f"--with {run_dir}: its configuration of {name} is not that of the first run")
+    return other.measured
 
 
 @common.command(

@@ -293,12 +293,23 @@ class LightConfig(Model):
     vergence_1_m: NonNegative  # 1 over the distance from that origin to where its rays meet; 0 = parallel light
 
 
+class NetworkConfig(Model):
+    """Self-calibration of the laser network: drift of its scale, priors of what the lengths show to have changed."""
+
+    drift_sigma_per_h: NonNegative
+    offset_changed_m: Positive
+    collimator_moved_m: Positive
+    refraction_changed: Positive
+    drift_changed_per_h: Positive
+
+
 class AlignConfig(Model):
     """The alignment result of a survey."""
 
     point_floor_m: NonNegative
     puck_height_sigma_m: NonNegative
     false_alarm: Annotated[float, Field(gt=0.0, lt=1.0)]
+    network: NetworkConfig
     light: dict[str, LightConfig] = Field(description="light at each mirror, by its name")  # by mirror name
 
 

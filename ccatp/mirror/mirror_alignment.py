@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import chdtri
 
-from ccatp.config.models import AlignConfig
-from ccatp.core import UNRELIABLE, Measured, PanelId, Vector3
+from ccatp.config.models import AlignConfig, Config
+from ccatp.core import UNRELIABLE, FloatArray, Measured, PanelId, PointId, Vector3
 from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.network_points import CalibratedSurveys, calibrate_surveys
 from ccatp.mirror.panel_alignment import (
     Deviations,
     MirrorWavefront,
@@ -51,14 +53,42 @@ class SurveyResult:
     warnings: tuple[str, ...]
 
 
+class AlignedSurvey(NamedTuple):
+    """Alignment of a survey, and the network by which its fixes were computed again; None without lengths."""
+
+    result: SurveyResult
+    network: CalibratedSurveys | None
+
+
+def align_survey(
+    cfg: Config,
+    mirror: Mirror,
+    measured: Sequence[Measured],
+    planned: Iterable[PanelId],
+    others: Sequence[Sequence[Measured]] = (),
+) -> AlignedSurvey:
+    """Adjust the laser network to all lengths, also to those of ``others`` (surveys of the same night); fit panels."""
+    network = calibrate_surveys(mirror, cfg.etalon, cfg.align, [measured, *others])
+    common = None
+    if network is not None:
+        own = network.surveys[0]
+        measured, common = own.measured, own.common.of_point
+    result = survey_result(mirror, cfg.align, cfg.robot.puck_height_m, measured, planned, common)
+    return AlignedSurvey(result, network)
+
+
 def survey_result(
     mirror: Mirror,
     cfg: AlignConfig,
     puck_height_m: float,
     measured: Iterable[Measured],
     planned: Iterable[PanelId],
+    common: Mapping[PointId, FloatArray] | None = None,
 ) -> SurveyResult:
-    """Fit every panel; a ``planned`` panel without enough fixes is listed as undetermined."""
+    """Fit every panel; a ``planned`` panel without enough fixes is listed as undetermined.
+
+    ``common``: errors of the points that panels share, as of ``network_points.CommonErrors``.
+    """
     warnings: list[str] = []
     by_panel: dict[PanelId, list[Measured]] = {panel: [] for panel in sorted(set(planned))}
     for one in measured:
@@ -66,7 +96,7 @@ def survey_result(
     usable: dict[PanelId, Deviations] = {}
     undetermined = []
     for panel, some in by_panel.items():
-        deviations, why = _deviations(mirror, cfg, puck_height_m, panel, some)
+        deviations, why = _deviations(mirror, cfg, puck_height_m, panel, some, common)
         if deviations is None:
             undetermined.append(Undetermined(panel, len(some), why))
         else:
@@ -96,7 +126,12 @@ def survey_result(
 
 
 def _deviations(
-    mirror: Mirror, cfg: AlignConfig, puck_height_m: float, panel: PanelId, measured: Sequence[Measured]
+    mirror: Mirror,
+    cfg: AlignConfig,
+    puck_height_m: float,
+    panel: PanelId,
+    measured: Sequence[Measured],
+    common: Mapping[PointId, FloatArray] | None,
 ) -> tuple[Deviations | None, str]:
     """Deviations that can be fitted, or None and the reason."""
     reliable = [one for one in measured if one.fix.metrology != UNRELIABLE]
@@ -109,7 +144,7 @@ def _deviations(
     if len(measured) < ENOUGH:
         return None, f"{len(measured)} of {ENOUGH} points that it takes"
     try:
-        found = deviations_of(mirror, panel, measured, puck_height_m, cfg.point_floor_m)
+        found = deviations_of(mirror, panel, measured, puck_height_m, cfg.point_floor_m, common)
     except ConvergenceError as error:
         return None, f"a fix is far from the mirror: {error}"
     if not (found.sigmas_m > 0.0).all():
@@ -141,14 +176,20 @@ def _remarks(result: PanelResult, rare: float) -> list[str]:
     return lines
 
 
+def joint_covariance(panels: Sequence[PanelResult], errors: slice = slice(None)) -> FloatArray:
+    """Covariance of piston, tip and tilt of all panels, (3 panels, 3 panels); of ``errors`` among the common ones."""
+    common = np.vstack([panel.fit.common[:, errors] for panel in panels])
+    return np.asarray(block_diag(*(panel.fit.own_covariance for panel in panels)) + common @ common.T)
+
+
 BAND = 0.99
 
 
 class Comparison(NamedTuple):
     """Fitted minus simulated misalignment over all panels that could be fitted; tip and tilt together.
 
-    ``chi2``: sum of ``e^T C^-1 e`` over the panels, with the three differences e and their covariance C. ``low`` and
-    ``high``: its 99 % interval if the covariances are right.
+    ``chi2``: ``e^T C^-1 e`` with the three differences of all panels e and their covariance C. ``low`` and ``high``:
+    its 99 % interval if the covariances are right.
     """
 
     panels: int
@@ -171,8 +212,8 @@ def compare(panels: Sequence[PanelResult], injected: Mapping[PanelId, Vector3]) 
     if not known:
         return None
     errors = np.array([panel.fit.values - np.array(injected[panel.panel]) for panel in known])
-    chi2 = sum(float(e @ np.linalg.solve(p.fit.covariance, e)) for e, p in zip(errors, known, strict=True))
-    dof = errors.size
+    flat, dof = errors.ravel(), errors.size
+    chi2 = float(flat @ np.linalg.solve(joint_covariance(known), flat))
     return Comparison(
         panels=len(known),
         piston_rms_m=float(np.sqrt(np.mean(errors[:, 0] ** 2))),

@@ -5,7 +5,7 @@ The displacement along a panel's normal is ``D(x, y) = sum c_i m_i(x, y)`` with 
 twist and bowl, which five adjusters can change. The method is in docs/align.md.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import sqrt
@@ -25,7 +25,8 @@ class Deviations(NamedTuple):
 
     ``places_m`` (k, 2) in the panel frame and ``deck_m`` (k, 2) are the surface points under the puck, ``values_m``
     (k,) the deviations along the local normal, > 0 towards the robot. ``lever`` (k,): scalar product of the local and
-    the panel's normal, the deviation per displacement D along the panel's normal.
+    the panel's normal, the deviation per displacement D along the panel's normal. ``common`` (k, r): change of the
+    deviations per independent error of standard deviation 1 that they share with other panels, not part of the sigmas.
     """
 
     points: tuple[PointId, ...]
@@ -35,15 +36,23 @@ class Deviations(NamedTuple):
     sigmas_m: FloatArray
     lever: FloatArray
     metrology: tuple[str, ...] = ()
+    common: FloatArray | None = None
 
 
 def deviations_of(
-    mirror: Mirror, panel: PanelId, measured: Sequence[Measured], puck_height_m: float, floor_m: float
+    mirror: Mirror,
+    panel: PanelId,
+    measured: Sequence[Measured],
+    puck_height_m: float,
+    floor_m: float,
+    common: Mapping[PointId, FloatArray] | None = None,
 ) -> Deviations:
     """Deviations of the points of a panel; their variance is ``n^T C n + floor^2``.
 
     A lateral error of the fix only moves the point along the surface. ``floor_m``: independent error of each point that
-    the covariance of its fix does not include. Raises ``UnknownPanelError``, ``ConvergenceError`` far from the mirror.
+    the covariance of its fix does not include. ``common``: errors of the points, (3, r), world frame.
+
+    Raises ``UnknownPanelError``, ``ConvergenceError`` far from the mirror.
     """
     chosen = sorted(measured, key=lambda one: one.point)
     body = mirror.panel(panel)
@@ -54,6 +63,11 @@ def deviations_of(
     world = np.array([mirror.rotate_world_from_deck(normal) for normal in normals])
     covariances = np.array([one.fix.covariance_m2 for one in chosen], dtype=np.float64).reshape(-1, 3, 3)
     variances = np.einsum("ki,kij,kj->k", world, covariances, world) + floor_m**2
+    shared = None
+    if common:
+        width = len(next(iter(common.values()))[0])
+        moves = [common.get(one.point, np.zeros((3, width))) for one in chosen]
+        shared = np.einsum("ki,kir->kr", world, np.array(moves))
     return Deviations(
         points=tuple(one.point for one in chosen),
         places_m=np.array(places),
@@ -62,6 +76,7 @@ def deviations_of(
         sigmas_m=np.sqrt(variances),
         lever=np.array(normals) @ np.array(body.axes[2]),
         metrology=tuple(one.fix.metrology for one in chosen),
+        common=shared,
     )
 
 
@@ -92,7 +107,9 @@ def adjustable(places_m: FloatArray) -> FloatArray:
 class ModeFit(NamedTuple):
     """Coefficients (m,) by weighted least squares, in m, rad and 1/m, with their covariance (m, m) and residuals (k,).
 
-    ``residual_variance_m2``: expected mean square of the residuals from the uncertainty of the points.
+    ``residual_variance_m2``: expected mean square of the residuals from the uncertainty of the points. ``common``
+    (m, r): change of the coefficients per error that other panels share; the covariance contains it, so that
+    ``common @ other.common.T`` is the covariance with another panel.
     """
 
     values: FloatArray
@@ -101,6 +118,12 @@ class ModeFit(NamedTuple):
     residual_variance_m2: float
     chi2: float
     dof: int
+    common: FloatArray
+
+    @property
+    def own_covariance(self) -> FloatArray:
+        """The covariance without the errors that other panels share."""
+        return np.asarray(self.covariance - self.common @ self.common.T)
 
     @property
     def sigma(self) -> FloatArray:
@@ -113,10 +136,13 @@ class ModeFit(NamedTuple):
         return float(np.mean(self.residuals_m**2)) - self.residual_variance_m2
 
 
-def fit_modes(design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray) -> ModeFit | None:
+def fit_modes(
+    design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray, common: FloatArray | None = None
+) -> ModeFit | None:
     """Weighted least squares by QR; None if the points do not determine the coefficients.
 
     ``design`` (k, m): modes at the points, each row times the point's lever; deviations and sigmas > 0, shape (k,).
+    ``common`` (k, r): errors of the deviations that other panels share; they do not change the weights.
     """
     count, modes = design.shape
     if count < modes:
@@ -132,7 +158,16 @@ def fit_modes(design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray) ->
     left = target - whitened @ solution
     # The whitened residuals are the projection 1 - Q Q^T of unit noise.
     expected = float(np.mean(sigmas_m**2 * (1.0 - np.sum(q * q, axis=1))))
-    return ModeFit(solution, spread @ spread.T, left * sigmas_m, expected, float(left @ left), count - modes)
+    shared = np.zeros((modes, 0)) if common is None else spread @ (q.T @ (common / sigmas_m[:, None]))
+    return ModeFit(
+        values=solution,
+        covariance=spread @ spread.T + shared @ shared.T,
+        residuals_m=left * sigmas_m,
+        residual_variance_m2=expected,
+        chi2=float(left @ left),
+        dof=count - modes,
+        common=shared,
+    )
 
 
 def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
@@ -386,7 +421,8 @@ def panel_result(
     kept, has_shape = explain(deviations, price)
     places, lever = deviations.places_m[kept], deviations.lever[kept, None]
     values, sigmas = deviations.values_m[kept], deviations.sigmas_m[kept]
-    fit = fit_modes(lever * rigid(places), values, sigmas)
+    common = None if deviations.common is None else deviations.common[kept]
+    fit = fit_modes(lever * rigid(places), values, sigmas, common)
     if fit is None:
         return None
     body = mirror.panel(panel)
@@ -396,8 +432,8 @@ def panel_result(
         wavefront = panel_wavefront(body, cos_i, found, gram(modes, half_size_m(body)), sigmas)
         return AdjusterPlan(adjuster_moves(found, modes, adjusters), wavefront)
 
-    bent = fit_modes(lever * adjustable(places), values, sigmas)
-    full = fit_modes(lever * quadratic(places), values, sigmas)
+    bent = fit_modes(lever * adjustable(places), values, sigmas, common)
+    full = fit_modes(lever * quadratic(places), values, sigmas, common)
     shape = None
     if full is not None:
         gain = fit.chi2 - full.chi2

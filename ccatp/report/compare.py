@@ -10,6 +10,8 @@ from scipy.special import chdtrc, chdtri
 
 from ccatp.config.files import write_file
 from ccatp.core import FloatArray, PanelId
+from ccatp.mirror.mirror_alignment import joint_covariance
+from ccatp.mirror.network_points import CalibratedSurveys
 from ccatp.mirror.panel_alignment import PanelResult, mirror_wavefront
 from ccatp.report.figures import distribution_figure, errors_figure, time_figure
 from ccatp.report.findings import KINDS, Findings, findings_of
@@ -50,20 +52,40 @@ class Changes(NamedTuple):
         return self.chi2 <= self.high and not any(panel.has_moved for panel in self.panels)
 
 
-def panel_changes(pairs: Sequence[tuple[PanelResult, PanelResult]]) -> Changes | None:
-    """Compare the panels of two surveys of one mirror; None without panels. Another puck looks like a move of all."""
+def panel_changes(
+    pairs: Sequence[tuple[PanelResult, PanelResult]], errors: tuple[slice, slice] = (slice(None), slice(None))
+) -> Changes | None:
+    """Compare the panels of two surveys of one mirror; None without panels. Another puck looks like a move of all.
+
+    ``errors``: those of the errors common to the panels of a survey that differ between the surveys.
+    """
     if not pairs:
         return None
+    one, other = ([pair[k] for pair in pairs] for k in (0, 1))
+    covariance = joint_covariance(one, errors[0]) + joint_covariance(other, errors[1])
     changes = []
-    for one, other in pairs:
-        values = other.fit.values - one.fit.values
-        covariance = other.fit.covariance + one.fit.covariance
-        chi2 = float(values @ np.linalg.solve(covariance, values))
+    for number, (before, after) in enumerate(pairs):
+        part = slice(_MODES * number, _MODES * (number + 1))
+        values, own = after.fit.values - before.fit.values, covariance[part, part]
+        chi2 = float(values @ np.linalg.solve(own, values))
         has_moved = float(chdtrc(_MODES, chi2)) < FALSE_ALARM / len(pairs)
-        changes.append(PanelChange(other.panel, values, np.sqrt(np.diag(covariance)), chi2, has_moved))
+        changes.append(PanelChange(after.panel, values, np.sqrt(np.diag(own)), chi2, has_moved))
     dof = _MODES * len(changes)
     low, high = (float(chdtri(dof, at)) for at in (0.5 + 0.5 * BAND, 0.5 - 0.5 * BAND))
-    return Changes(tuple(changes), sum(change.chi2 for change in changes), dof, low, high)
+    every = np.concatenate([change.values for change in changes])
+    return Changes(tuple(changes), float(every @ np.linalg.solve(covariance, every)), dof, low, high)
+
+
+def differing_errors(a: CalibratedSurveys | None, b: CalibratedSurveys | None) -> tuple[slice, slice]:
+    """The errors by the networks of two surveys that differ: those by noise, if the network is the same.
+
+    Errors by the priors are then equal, and cancel. If the network has changed between the surveys, none cancel.
+    """
+    if a is None or b is None or a.network.adjustment.slices != b.network.adjustment.slices:
+        return slice(None), slice(None)
+    if not np.array_equal(a.network.adjustment.prior, b.network.adjustment.prior):
+        return slice(None), slice(None)
+    return slice(a.surveys[0].common.by_noise), slice(b.surveys[0].common.by_noise)
 
 
 class RunPair:
@@ -83,7 +105,9 @@ class RunPair:
         fitted = [() if found.alignment is None else found.alignment.panels for found in (a, b)]
         self.panels = [{panel.panel: panel for panel in panels} for panels in fitted]
         common = [panel for panel in self.panels[1] if panel in self.panels[0] and self.is_one_mirror]
-        self.changes = panel_changes([(self.panels[0][panel], self.panels[1][panel]) for panel in common])
+        self.changes = panel_changes(
+            [(self.panels[0][panel], self.panels[1][panel]) for panel in common], differing_errors(a.network, b.network)
+        )
         self.wavefronts = [
             mirror_wavefront([panel.rigid.wavefront for panel in panels.values() if panel.panel in common])
             for panels in self.panels

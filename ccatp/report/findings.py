@@ -17,9 +17,11 @@ from ccatp.errors import ExitStatus
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.filters.metrics import Consistency, consistency, rms
 from ccatp.mirror.layout import POINTS_PER_PANEL
-from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
+from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, align_survey, compare
+from ccatp.mirror.network_points import CalibratedSurveys
 from ccatp.records.summary import arrival_error_m, distribution, measured_error_m
 from ccatp.records.timeline import common_rows, row_before, rows_of
+from ccatp.report.network import remarks
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, RunRecord
 from ccatp.survey.composition import plan_survey
 from ccatp.survey.ending import ending_of, read_ending, why_text
@@ -356,28 +358,30 @@ class Findings:
     figures: dict[str, float] | None  # of their distribution
     budget: TimeBreakdown | None
     alignment: SurveyResult | None
+    network: CalibratedSurveys | None  # of the laser, by which the fixes were computed again
     against: Comparison | None
     quality: Quality
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Damaged parts of the run, and doubtful results of its alignment."""
-        return self.record.warnings + (self.alignment.warnings if self.alignment is not None else ())
+        aligned = () if self.alignment is None else self.alignment.warnings
+        return (*self.record.warnings, *remarks(self.network), *aligned)
 
 
 def findings_of(record: RunRecord) -> Findings:
     """Compute the results of a recorded run."""
     errors, cfg = error_series(record), record.cfg
-    alignment = against = None
+    alignment = network = against = None
     if record.measured:
         planned = {row.point.panel for row in record.points or ()}
-        alignment = survey_result(record.mirror, cfg.align, cfg.robot.puck_height_m, record.measured, planned)
+        alignment, network = align_survey(cfg, record.mirror, record.measured, planned)
         against = compare(alignment.panels, record.injected) if record.injected else None
     # Without a point that was measured there is no figure of the localization, as in ``summary.json``.
     figures = None if errors is None or not record.measured else error_figures(errors)
     outcome, points, budget = outcome_of(record), point_verdicts(record), time_budget(record)
     quality = quality_of(record, alignment)
-    return Findings(record, outcome, points, errors, figures, budget, alignment, against, quality)
+    return Findings(record, outcome, points, errors, figures, budget, alignment, network, against, quality)
 
 
 def observation_of(record: RunRecord) -> dict[str, str]:

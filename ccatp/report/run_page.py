@@ -17,6 +17,7 @@ from ccatp.report.alignment import worst_corner
 from ccatp.report.findings import Findings, Grade, coverage_of, findings_of, observation_of
 from ccatp.report.html import MICRO, Draw, RunReport, events_of, page_figures, render, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure
+from ccatp.report.network import network_data, sentence, undetermined_text
 from ccatp.report.plots import check_drawing
 from ccatp.report.record import WITHIN_MM, kind_of_run, read_record
 from ccatp.report.tables import write_tables
@@ -72,6 +73,8 @@ def run_page(found: Findings) -> str:
         record=record,
         alignment=found.alignment,
         data=run_data(found),
+        network=sentence(found.network) if found.record.measured else "",
+        not_determined=undetermined_text(found.network),
         figures=page_figures(run_drawings(found)),
         within_mm=f"{WITHIN_MM:.0f}",
         never=Counter(verdict.why for verdict in found.points if verdict.grade is Grade.OPEN),
@@ -134,6 +137,7 @@ def run_data(found: Findings) -> dict[str, Any]:
             "is_exact": budget.is_exact,
         },
         "half_wavefront_um": found.alignment and wavefront_data(found.alignment.wavefront),
+        "network": network_data(found.network),
         "missing": list(record.missing),
         "warnings": list(record.warnings),
     }

@@ -42,7 +42,7 @@ _FIXES = {
     "left_out": "channels that contradict the others and were left out",
     "detectable_m": "smallest error of one length that the test of the lengths finds",
     "protection_m": "largest error of the position by an error of one length that the test does not find",
-    "deviation_um": "surface less the ideal one along its normal, > 0 towards the robot",
+    "deviation_um": "surface less the ideal one along its normal by the adjusted laser network, > 0 towards the robot",
     "sigma_deviation_um": _SIGMA,
     "residual_um": "deviation less the fitted plane of the panel",
     "is_outlier": "1: not used for the fit of the panel",

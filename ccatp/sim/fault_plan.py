@@ -174,6 +174,7 @@ TYPES: dict[str, dict[str, type[InjectedFault]]] = {
     "faults": _types(LastingFault, {"raise": {"names": Annotated[tuple[_RaisedName, ...], Field(min_length=1)]}}),
     # The simulated laser system. Errors of one channel, or of all without ``channel``: ``offset_m``, ``rate_m_s`` times
     # the time since the begin, in proportion, rounded, the last length again, or ``factor`` times the noise.
+    # ``scale_drift``: in proportion to the length and the time. ``moved``: its collimator, world frame.
     # ``at_rest``: it stays at the puck's place of the begin, with new noise.
     "laser": _types(
         LastingFault,
@@ -184,6 +185,8 @@ TYPES: dict[str, dict[str, type[InjectedFault]]] = {
             "rounded": {"channel": _CHANNEL, "to_m": Positive},
             "frozen": {"channel": _CHANNEL},
             "noisy": {"channel": _CHANNEL, "factor": Positive},
+            "scale_drift": {"channel": _CHANNEL, "rate_1_s": float},
+            "moved": {"channel": Annotated[int, Field(ge=1, le=32)], "by_m": tuple[float, float, float]},
             "at_rest": {},
         },
     ),

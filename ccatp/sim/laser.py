@@ -83,10 +83,13 @@ class EtalonModel:
             return self._format(channel, 0.0, flags | {"beam_break"})
         active = [(key, one) for key, one in enumerate(self.faults) if one.is_active(puck.t_s)]
         position_m = puck.position_m
+        at_m = collimator
         for key, fault in active:
             if fault.type == "at_rest":
                 position_m = self._held.setdefault(key, position_m)
-        length_m = math.dist(collimator, position_m)
+            if fault.type == "moved" and fault.channel == channel:
+                at_m = [place + move for place, move in zip(at_m, fault.by_m, strict=True)]
+        length_m = math.dist(at_m, position_m)
         sigma_m = self._cfg.length_sigma_m + self._cfg.length_sigma_per_m * length_m
         error_m = sigma_m * self._noise(puck.t_s, channel)
         found_m = length_m + error_m
@@ -101,6 +104,8 @@ class EtalonModel:
                 return length_m + float(fault.offset_m)
             case "drift":
                 return length_m + float(fault.rate_m_s) * (t_s - float(fault.at_s))
+            case "scale_drift":
+                return length_m * (1.0 + float(fault.rate_1_s) * (t_s - float(fault.at_s)))
             case "scaled":
                 return length_m * float(fault.factor)
             case "rounded":

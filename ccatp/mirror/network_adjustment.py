@@ -1,0 +1,374 @@
+"""The laser network from all lengths of a survey: what changed in it, tested, and what stays uncertain.
+
+Every effect has the prior of the configuration. One that the lengths contradict gets a wide prior, ``moved`` (stepwise:
+the score test of each candidate, the most significant first). Candidates are the effects themselves, the same from
+some point on, and single lengths. Among them the test decides with a probability of a false finding per survey that is
+configured. If another candidate explains the lengths nearly as well, both get the wide prior, and both are named. An
+effect that is suspect only (chance ``_SUSPECT``) gets the wide prior, too, and is not named: the uncertainties are then
+honest for errors that are too small to be found.
+
+The noise of the lengths is measured with all effects free, so that larger noise makes no findings.
+"""
+
+from collections.abc import Iterable, Mapping
+from enum import StrEnum
+from math import log, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from ccatp.config.models import EtalonConfig, NetworkConfig
+from ccatp.core import BoolArray, FloatArray, IntArray
+from ccatp.mirror.network_model import (
+    Adjustment,
+    Effect,
+    EffectKind,
+    SurveyLengths,
+    adjust,
+    equal_effects,
+    length_scores,
+    score_since,
+)
+
+UNDETERMINED = 0.9  # ratio of the posterior to the prior sigma from which an effect is not determined by the lengths
+_SUSPECT = 0.01  # chance of a score by noise below which an effect gets the wide prior
+_CLEAR = 13.8  # least difference of the chi-squares of two explanations, one of which is a thousand times as likely
+_GRID = 100  # first points at which a change is looked for; then at every point near the best
+_LEAST_PART = 5  # points before and after a change
+_MOST_FINDINGS = 40
+_FRAME = 3  # collimators that must agree with each other to be a frame for the others
+_NEEDED = 4  # lengths of a point
+_LOCATED_FROM = 6  # lengths of a point, of which one can be found to be wrong
+_IGNORED_M = 1e3  # sigma of the lengths of a point that is left out
+# Of a prior of 0, which stands for exact values.
+_EXACT = {EffectKind.OFFSET: 1e-9, EffectKind.COLLIMATOR: 1e-9, EffectKind.SCALE: 1e-11, EffectKind.DRIFT: 1e-11}
+
+
+class NetworkState(StrEnum):
+    """What the lengths say of the network as configured."""
+
+    CONSISTENT = "consistent"
+    CHANGED = "changed"
+    TOO_FEW = "too_few"  # points to test it
+
+
+class Finding(NamedTuple):
+    """An effect that is larger than its prior permits, as if it were the only explanation.
+
+    ``alternatives``: other effects that explain the lengths nearly as well; the lengths do not decide between them.
+    """
+
+    effect: Effect
+    values: FloatArray
+    covariance: FloatArray
+    alternatives: tuple[Effect, ...]
+
+    @property
+    def size(self) -> float:
+        """Its value, or the length of the move of a collimator."""
+        return float(np.linalg.norm(self.values)) if len(self.values) > 1 else float(self.values[0])
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of ``size``."""
+        along = self.values / max(float(np.linalg.norm(self.values)), 1e-300)
+        return float(sqrt(along @ self.covariance @ along))
+
+
+class NetworkResult(NamedTuple):
+    """The network of one or more surveys.
+
+    ``undetermined``: effects of which the lengths say nothing. ``noise``: measured over configured noise of a length,
+    at least 1; ``is_noisy``: significantly larger. ``bad_lengths`` (k, m): single lengths that contradict all others,
+    left out; ``bad_points`` (k,): points whose lengths contradict each other, left out. ``has_frame``: enough
+    collimators agree with each other to say which of the others moved.
+    """
+
+    state: NetworkState
+    given: SurveyLengths
+    adjustment: Adjustment
+    findings: tuple[Finding, ...]
+    undetermined: tuple[Effect, ...]
+    noise: float
+    is_noisy: bool
+    chi2: float
+    dof: int
+    bad_lengths: BoolArray
+    bad_points: BoolArray
+    has_frame: bool
+
+
+class _Search(NamedTuple):
+    """The stepwise search: sigmas of the effects, wide ones among them, and what is left out."""
+
+    sigmas: Mapping[Effect, float]
+    wide: frozenset[Effect]
+    bad_lengths: BoolArray
+    bad_points: BoolArray
+
+
+class NetworkSearch:
+    """Priors and limits of the adjustment of one set of lengths."""
+
+    def __init__(self, given: SurveyLengths, etalon: EtalonConfig, cfg: NetworkConfig, false_alarm: float) -> None:
+        self._given = given
+        count, channels = given.lengths_m.shape
+        self._usual = {
+            EffectKind.OFFSET: etalon.offset_sigma_m,
+            EffectKind.COLLIMATOR: etalon.collimator_sigma_m,
+            EffectKind.SCALE: etalon.refraction_sigma,
+            EffectKind.DRIFT: cfg.drift_sigma_per_h,
+        }
+        self._usual = {kind: max(sigma, _EXACT[kind]) for kind, sigma in self._usual.items()}
+        self._moved = {
+            EffectKind.OFFSET: cfg.offset_changed_m,
+            EffectKind.COLLIMATOR: cfg.collimator_moved_m,
+            EffectKind.SCALE: cfg.refraction_changed,
+            EffectKind.DRIFT: cfg.drift_changed_per_h,
+        }
+        self.effects = equal_effects(channels, given.surveys)
+        # Half of the false alarms of a survey, as other tests of its lengths have the rest.
+        self._prices = {
+            size: (
+                float(chdtri(size, 0.05 * false_alarm / len(self.effects))),
+                change_price(size, 0.25 * false_alarm / (2 * channels + given.surveys), count),
+            )
+            for size in (1, 3)
+        }
+        self._free: Adjustment | None = None
+        self._length_price = float(chdtri(1, 0.2 * false_alarm / max(count * channels, 1)))
+        self._noise_chance = 0.25 * false_alarm
+
+    def run(self) -> NetworkResult:
+        """Search, and adjust with what was found."""
+        found = self._begin()
+        given = self._used(found)
+        redundant = int(np.maximum(np.isfinite(given.lengths_m).sum(axis=1) - 3, 0).sum())
+        unknowns = sum(effect.size for effect in self.effects)
+        if redundant < unknowns:
+            return self._result(NetworkState.TOO_FEW, found, [], adjust(given, dict(found.sigmas)))
+        found, adjustment = self._forward(found)
+        findings: list[Finding] = []
+        state = NetworkState.CHANGED
+        if self._has_frame(found):
+            findings = self._findings(found, adjustment)
+            if not findings:
+                state = NetworkState.CONSISTENT
+            for effect in {other for one in findings for other in one.alternatives}:
+                found = self._widened(found, effect)
+        else:
+            # Which collimators moved cannot be said: all may have.
+            for effect in self.effects:
+                if effect.kind is EffectKind.COLLIMATOR:
+                    found = self._widened(found, effect)
+        adjustment = adjust(self._used(found), dict(found.sigmas), adjustment.noise, adjustment)
+        return self._result(state, found, findings, adjustment)
+
+    def _begin(self) -> _Search:
+        is_valid = np.isfinite(self._given.lengths_m)
+        short = is_valid.sum(axis=1) < _NEEDED
+        nothing = np.zeros(is_valid.shape, dtype=np.bool_)
+        return _Search({one: self._usual[one.kind] for one in self.effects}, frozenset(), nothing, short)
+
+    def _used(self, found: _Search) -> SurveyLengths:
+        """Without what is left out; a point that is left out has all its lengths, with hardly any weight."""
+        given = self._given.without(found.bad_lengths)
+        return given._replace(sigmas_m=np.where(found.bad_points[:, None], _IGNORED_M, given.sigmas_m))
+
+    def _widened(self, found: _Search, effect: Effect) -> _Search:
+        return found._replace(sigmas={**found.sigmas, effect: self._moved[effect.kind]}, wide=found.wide | {effect})
+
+    def _narrowed(self, found: _Search, effect: Effect) -> _Search:
+        sigmas = {one: sigma for one, sigma in found.sigmas.items() if one != effect}
+        if effect.since == 0:
+            sigmas = {**found.sigmas, effect: self._usual[effect.kind]}
+        return found._replace(sigmas=sigmas, wide=found.wide - {effect})
+
+    def _noise(self, found: _Search) -> float:
+        """Measured over configured noise, with all effects free and the found changes; at least 1.
+
+        By the median over the points, which a few wrong lengths hardly change.
+        """
+        sigmas = {one: self._moved[one.kind] for one in (*self.effects, *found.wide)}
+        given = self._used(found)
+        free = self._free = adjust(given, sigmas, start=self._free)
+        used = ~found.bad_points & (free.dof > 0)
+        if not used.any():
+            return 1.0
+        absorbed = len(free.values) - float(np.sum(np.diag(free.covariance) / free.prior))
+        total = float(free.dof[used].sum())
+        ratio = float(np.median(free.chi2[used] / chdtri(free.dof[used], 0.5)))
+        return sqrt(max(ratio / max(1.0 - absorbed / total, 1.0 / total), 1.0))
+
+    def _forward(self, found: _Search) -> tuple[_Search, Adjustment]:
+        adjustment = adjust(self._used(found), dict(found.sigmas), self._noise(found))
+        for _ in range(_MOST_FINDINGS):
+            gain, effect = self._best(found, adjustment)
+            lengths = length_scores(adjustment) - self._length_price
+            worst = float(np.max(np.where(found.bad_points[:, None], -np.inf, lengths)))
+            if max(gain, worst) <= 0.0:
+                break
+            found = self._widened(found, effect) if gain >= worst else self._left_out(found, lengths, worst)
+            adjustment = adjust(self._used(found), dict(found.sigmas), self._noise(found), adjustment)
+            found, adjustment = self._pruned(found, adjustment, effect)
+        return self._with_suspects(found, adjustment)
+
+    def _with_suspects(self, found: _Search, adjustment: Adjustment) -> tuple[_Search, Adjustment]:
+        for _ in self.effects:
+            given = self._used(found)
+            chances = {
+                one: float(chdtrc(one.size, score_since(adjustment, one, given, np.array([0]))[0]))
+                for one in self.effects
+                if one not in found.wide
+            }
+            effect = min(chances, key=lambda one: chances[one], default=None)
+            if effect is None or chances[effect] > _SUSPECT:
+                break
+            found = self._widened(found, effect)
+            adjustment = adjust(given, dict(found.sigmas), adjustment.noise, adjustment)
+        return found, adjustment
+
+    def _pruned(self, found: _Search, adjustment: Adjustment, newest: Effect) -> tuple[_Search, Adjustment]:
+        """Without effects that were widened before and are no longer significant."""
+        for effect in found.wide - {newest}:
+            values, covariance = adjustment.of(effect), adjustment.covariance_of(effect)
+            usual = self._usual[effect.kind] ** 2 if effect.since == 0 else 0.0
+            spread = covariance + usual * np.eye(effect.size)
+            if float(values @ np.linalg.solve(spread, values)) < self._price(effect):
+                found = self._narrowed(found, effect)
+                adjustment = adjust(self._used(found), dict(found.sigmas), adjustment.noise, adjustment)
+        return found, adjustment
+
+    def _price(self, effect: Effect) -> float:
+        return self._prices[effect.size][effect.since > 0]
+
+    def _gains(self, found: _Search, adjustment: Adjustment, also: int = 0) -> dict[Effect, float]:
+        """The best candidate of each kind, channel or survey, always and since some point, with what it gains.
+
+        ``also``: a point at which a change may begin, besides those of the grid.
+        """
+        given, gains = self._used(found), {}
+        for base in self.effects:
+            grid = self._firsts(base)
+            firsts = np.unique([0, also, *grid]) if len(grid) else np.array([0])
+            gained = score_since(adjustment, base, given, firsts)
+            if base not in found.wide:
+                gains[base] = float(gained[0]) - self._price(base)
+            if len(firsts) > 1:
+                at = 1 + int(np.argmax(gained[1:]))
+                step = base._replace(since=int(firsts[at]))
+                if step not in found.wide:
+                    gains[step] = float(gained[at]) - self._price(step)
+        return gains
+
+    def _firsts(self, base: Effect) -> IntArray:
+        """Points at which a change may begin, some apart."""
+        if base.kind is EffectKind.DRIFT:
+            return np.arange(0)
+        survey = self._given.survey
+        inside = np.flatnonzero(survey == base.of) if base.kind is EffectKind.SCALE else np.arange(len(survey))
+        inside = inside[_LEAST_PART:-_LEAST_PART]
+        return inside[:: max(1, -(-len(inside) // _GRID))]
+
+    def _best(self, found: _Search, adjustment: Adjustment) -> tuple[float, Effect]:
+        gains = self._gains(found, adjustment)
+        most = max(gains.values())
+        # The simplest of those that explain the lengths nearly as well as the best: an offset before a move.
+        near_best = [effect for effect, gain in gains.items() if most - gain < min(_CLEAR, max(most, 0.0))]
+        best = min(
+            near_best, key=lambda effect: (effect.size, -gains[effect]), default=max(gains, key=gains.__getitem__)
+        )
+        gain = gains[best]
+        if best.since:
+            near = np.arange(max(best.since - self._apart, 1), min(best.since + self._apart, len(self._given.survey)))
+            gained = score_since(adjustment, best._replace(since=0), self._used(found), near)
+            gain, best = float(gained.max()) - self._price(best), best._replace(since=int(near[np.argmax(gained)]))
+        return gain, best
+
+    @property
+    def _apart(self) -> int:
+        return -(-len(self._given.survey) // _GRID)
+
+    def _left_out(self, found: _Search, lengths: FloatArray, worst: float) -> _Search:
+        """Without the worst lengths, where one of a point is clearly the wrong one; otherwise without the point."""
+        bad_lengths, bad_points = found.bad_lengths.copy(), found.bad_points.copy()
+        valid = (np.isfinite(self._given.lengths_m) & ~bad_lengths).sum(axis=1)
+        for point in np.flatnonzero((lengths.max(axis=1) >= max(0.25 * worst, 1e-12)) & ~bad_points):
+            second, first = np.sort(lengths[point])[-2:]
+            if first - second >= _CLEAR and valid[point] >= _LOCATED_FROM:
+                bad_lengths[point, int(np.argmax(lengths[point]))] = True
+            else:
+                bad_points[point] = True
+        return found._replace(bad_lengths=bad_lengths, bad_points=bad_points)
+
+    def _findings(self, found: _Search, adjustment: Adjustment) -> list[Finding]:
+        """The significant effects, each with the candidates that explain the lengths nearly as well without it."""
+        findings = []
+        for effect in adjustment.slices:
+            if effect not in found.wide or self._ratio(found, adjustment, effect) > UNDETERMINED:
+                continue
+            without = self._narrowed(found, effect)
+            other = adjust(self._used(without), dict(without.sigmas), adjustment.noise, adjustment)
+            gains = self._gains(without, other, effect.since)
+            same = {one for one in gains if (one.kind, one.of) == (effect.kind, effect.of)}
+            mine = max((gains[one] for one in same), default=-np.inf)
+            if mine <= 0.0:
+                continue
+            alternatives = (one for one, gain in gains.items() if one not in same and mine - gain < _CLEAR)
+            findings.append(
+                Finding(effect, adjustment.of(effect), adjustment.covariance_of(effect), tuple(alternatives))
+            )
+        return findings
+
+    def _has_frame(self, found: _Search) -> bool:
+        moved = {one.of for one in found.wide if one.kind is EffectKind.COLLIMATOR and one.since == 0}
+        return not moved or self._given.lengths_m.shape[1] - len(moved) >= _FRAME
+
+    @staticmethod
+    def _ratio(found: _Search, adjustment: Adjustment, effect: Effect) -> float:
+        """Posterior over prior sigma of an effect, in its worst direction."""
+        return sqrt(float(np.linalg.eigvalsh(adjustment.covariance_of(effect))[-1])) / found.sigmas[effect]
+
+    def _result(
+        self, state: NetworkState, found: _Search, findings: Iterable[Finding], adjustment: Adjustment
+    ) -> NetworkResult:
+        used = ~found.bad_points
+        absorbed = len(adjustment.values) - float(np.sum(np.diag(adjustment.covariance) / adjustment.prior))
+        dof = max(round(float(adjustment.dof[used].sum()) - absorbed), 1)
+        chi2 = float(adjustment.chi2[used].sum()) * adjustment.noise**2
+        noise = sqrt(max(chi2 / dof, 1.0))
+        if noise != adjustment.noise:
+            adjustment = adjust(self._used(found), dict(found.sigmas), noise, adjustment)
+        return NetworkResult(
+            state=state,
+            given=self._given,
+            adjustment=adjustment,
+            findings=tuple(findings),
+            undetermined=tuple(one for one in adjustment.slices if self._ratio(found, adjustment, one) > UNDETERMINED),
+            noise=noise,
+            is_noisy=float(chdtrc(dof, chi2)) < self._noise_chance,
+            chi2=chi2,
+            dof=dof,
+            bad_lengths=found.bad_lengths,
+            bad_points=found.bad_points,
+            has_frame=self._has_frame(found),
+        )
+
+
+def change_price(size: int, chance: float, count: int) -> float:
+    """Least chi-square of a change at an unknown point of ``count``, for a probability of any such by noise.
+
+    Tail of the maximum of a chi-square process over the first points; James, James and Siegmund 1987.
+    """
+    part = _LEAST_PART / max(count, 2 * _LEAST_PART + 1)
+    span, price = 2.0 * log((1.0 - part) / part), float(chdtri(size, chance))
+    for _ in range(20):
+        looks = 1.0 + 0.5 * price * span * max(1.0 - size / price, 0.0) + 2.0
+        price = float(chdtri(size, chance / looks))
+    return price
+
+
+def calibrate(given: SurveyLengths, etalon: EtalonConfig, cfg: NetworkConfig, false_alarm: float) -> NetworkResult:
+    """Adjust the network with all lengths of one survey, or of several by the same collimators."""
+    return NetworkSearch(given, etalon, cfg, false_alarm).run()

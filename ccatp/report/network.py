@@ -1,0 +1,203 @@
+"""The laser network of a survey in words and as data: whether it is consistent, what changed, what is open."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from ccatp.core import FloatArray
+from ccatp.mirror.network_adjustment import Finding, NetworkState
+from ccatp.mirror.network_model import Effect, EffectKind
+from ccatp.mirror.network_points import CalibratedSurveys
+
+MICRO = 1e6
+GAUGE = "a common motion of all collimators, which shows in no length"
+
+
+def sentence(found: CalibratedSurveys | None) -> str:
+    """Whether the network is consistent, in one sentence; without the lengths that it takes, that they are missing."""
+    if found is None:
+        return "The laser network is not checked: no lengths are recorded."
+    network = found.network
+    lengths = int(np.isfinite(network.given.lengths_m).sum())
+    noise = f"noise {network.noise:.2f} times the configured one" if network.is_noisy else "noise as configured"
+    if network.state is NetworkState.TOO_FEW:
+        return f"The laser network is not checked: {len(found.points)} points with {lengths} lengths are too few."
+    if network.state is NetworkState.CONSISTENT:
+        return f"The laser network is consistent: {lengths} lengths, {noise}, no channel and no collimator has changed."
+    if not network.has_frame:
+        return (
+            "The laser network has changed: too few collimators agree with each other to say which of the others "
+            f"moved; survey all collimators again ({noise})."
+        )
+    changes = "; ".join(finding_text(found, one) for one in network.findings)
+    return f"The laser network has changed: {changes} ({noise}); the panels are computed with it."
+
+
+def remarks(found: CalibratedSurveys | None) -> list[str]:
+    """What an operator has to do or to know about the network, one line each."""
+    if found is None:
+        return []
+    network, lines = found.network, []
+    if network.state is NetworkState.CHANGED:
+        lines.append(sentence(found))
+    bad = np.argwhere(network.bad_lengths)
+    if len(bad):
+        lines.append(
+            f"single lengths that contradict all others are left out: {len(bad)} of "
+            f"{int(np.isfinite(network.given.lengths_m).sum())}, channels {_numbers(found, bad[:, 1])}"
+        )
+    if network.is_noisy:
+        lines.append(
+            f"the lengths have {network.noise:.2f} times the configured noise (etalon.length_sigma_m); "
+            "all standard deviations are larger in proportion"
+        )
+    without = sum(one.unchanged for one in found.surveys)
+    if without:
+        lines.append(f"{without} fixes have no lengths of this network: they are used as recorded")
+    return lines
+
+
+def undetermined_text(found: CalibratedSurveys | None) -> str:
+    """What the lengths do not determine; empty if the network was not checked."""
+    if found is None:
+        return ""
+    names = _joined(found, found.network.undetermined)
+    return f"Not determined by these lengths: {names + ', and ' if names else ''}{GAUGE}."
+
+
+def network_lines(found: CalibratedSurveys | None) -> list[str]:
+    """The network in the output of ``ccatp align``."""
+    return [line for line in ("", sentence(found), undetermined_text(found)) if line or found is not None]
+
+
+def finding_text(found: CalibratedSurveys, finding: Finding) -> str:
+    """A change with its size; with alternatives, that the lengths do not decide."""
+    text = _change(found, finding)
+    if not finding.alternatives:
+        return text
+    others = " or ".join(effect_name(found, one) for one in finding.alternatives)
+    return f"either {text}, or it is the {others}: the lengths do not decide"
+
+
+def _change(found: CalibratedSurveys, finding: Finding) -> str:
+    effect, size, sigma = finding.effect, finding.size, finding.sigma
+    since = _since(found, effect)
+    match effect.kind:
+        case EffectKind.OFFSET:
+            how = "long" if size > 0 else "short"
+            return f"channel {found.channels[effect.of]} reads {_um(abs(size), sigma)} um too {how}{since}"
+        case EffectKind.COLLIMATOR:
+            x, y, z = (MICRO * finding.values).tolist()
+            return (
+                f"the collimator of channel {found.channels[effect.of]} has moved by {_um(size, sigma)} um "
+                f"({x:+.0f}, {y:+.0f}, {z:+.0f} along world x, y, z){since}"
+            )
+        case EffectKind.SCALE:
+            return f"all lengths are {_ppm(size, sigma)} ppm too {'long' if size > 0 else 'short'}{since}"
+        case EffectKind.DRIFT:
+            return (
+                f"the scale of all lengths drifts by {_ppm(size, sigma, '+')} ppm per hour{_of_survey(found, effect)}"
+            )
+
+
+def _since(found: CalibratedSurveys, effect: Effect) -> str:
+    if not effect.since:
+        return _of_survey(found, effect)
+    point, t_s = found.points[effect.since]
+    return f" since about point {'/'.join(map(str, point))} ({t_s:.0f} s by the robot's clock)"
+
+
+def _of_survey(found: CalibratedSurveys, effect: Effect) -> str:
+    if effect.is_of_channel or len(found.surveys) == 1:
+        return ""
+    return f" in survey {effect.of + 1} of {len(found.surveys)}"
+
+
+def effect_name(found: CalibratedSurveys, effect: Effect) -> str:
+    """An effect without its value."""
+    names = {
+        EffectKind.OFFSET: "offset of channel",
+        EffectKind.COLLIMATOR: "collimator of channel",
+        EffectKind.SCALE: "scale",
+        EffectKind.DRIFT: "drift of the scale",
+    }
+    number = f" {found.channels[effect.of]}" if effect.is_of_channel else ""
+    return names[effect.kind] + number + _since(found, effect)
+
+
+def _joined(found: CalibratedSurveys, effects: Iterable[Effect]) -> str:
+    """Effects of one kind together."""
+    parts = []
+    for kind, name in ((EffectKind.COLLIMATOR, "collimators"), (EffectKind.OFFSET, "offsets of channels")):
+        numbers = [found.channels[one.of] for one in effects if one.kind is kind and not one.since]
+        if numbers:
+            parts.append(f"{name} {' '.join(map(str, numbers))}")
+    rest = [one for one in effects if one.since or not one.is_of_channel]
+    return ", ".join([*parts, *(effect_name(found, one) for one in rest)])
+
+
+def _numbers(found: CalibratedSurveys, columns: Iterable[int]) -> str:
+    return " ".join(str(found.channels[column]) for column in sorted(set(columns)))
+
+
+def _um(value: float, sigma: float) -> str:
+    return f"{MICRO * value:.1f} +- {MICRO * sigma:.1f}"
+
+
+def _ppm(value: float, sigma: float, sign: str = "") -> str:
+    value = value if sign else abs(value)
+    return f"{MICRO * value:{sign}.2f} +- {MICRO * sigma:.2f}"
+
+
+def network_data(found: CalibratedSurveys | None) -> dict[str, Any] | None:
+    """The network in the output of ``ccatp align --json``; None without lengths."""
+    if found is None:
+        return None
+    network = found.network
+    adjusted = network.adjustment
+    return {
+        "state": network.state.value,
+        "sentence": sentence(found),
+        "undetermined": [_effect_data(found, one) for one in network.undetermined],
+        "noise": round(network.noise, 4),
+        "is_noisy": network.is_noisy,
+        "chi2": round(network.chi2, 4),
+        "dof": network.dof,
+        "has_frame": network.has_frame,
+        "findings": [
+            {
+                **_effect_data(found, one.effect),
+                **_values(one.effect, one.values, np.sqrt(np.diag(one.covariance))),
+                "alternatives": [_effect_data(found, other) for other in one.alternatives],
+            }
+            for one in network.findings
+        ],
+        "effects": [
+            {
+                **_effect_data(found, one),
+                **_values(one, adjusted.of(one), np.sqrt(np.diag(adjusted.covariance_of(one)))),
+                "prior_sigma": round(MICRO * float(np.sqrt(adjusted.prior[adjusted.slices[one]][0])), 6),
+            }
+            for one in adjusted.slices
+        ],
+        "bad_lengths": [
+            {"point": list(found.points[row][0]), "channel": found.channels[column]}
+            for row, column in np.argwhere(network.bad_lengths).tolist()
+        ],
+        "bad_points": [list(found.points[row][0]) for row in np.flatnonzero(network.bad_points).tolist()],
+    }
+
+
+def _effect_data(found: CalibratedSurveys, effect: Effect) -> dict[str, Any]:
+    name = {"channel": found.channels[effect.of]} if effect.is_of_channel else {"survey": effect.of}
+    since = list(found.points[effect.since][0]) if effect.since else None
+    return {"kind": effect.kind.value, **name, "since": since}
+
+
+def _values(effect: Effect, values: FloatArray, sigmas: FloatArray) -> dict[str, Any]:
+    unit = "um" if effect.is_of_channel else ("ppm" if effect.kind is EffectKind.SCALE else "ppm_per_h")
+    return {
+        f"value_{unit}": [round(MICRO * float(value), 4) for value in values],
+        f"sigma_{unit}": [round(MICRO * float(sigma), 4) for sigma in sigmas],
+    }
