@@ -14,6 +14,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.network_points import CalibratedSurveys, calibrate_surveys
 from ccatp.mirror.panel_alignment import (
     Deviations,
+    Explanation,
     MirrorWavefront,
     PanelResult,
     Prices,
@@ -165,7 +166,14 @@ def _unreliable(by_panel: Iterable[Sequence[Measured]]) -> list[str]:
 def _remarks(result: PanelResult, rare: float) -> list[str]:
     where = f"panel {result.panel.row}/{result.panel.col}"
     lines = []
-    if result.outliers:
+    if result.alternatives:
+        *others, last = (_explained(result, one) for one in (result.explained, *result.alternatives))
+        where_again = "/".join(map(str, result.deciding or ()))
+        lines.append(
+            f"{where}: its points do not decide between {', '.join(others)} and {last}; its moves are uncertain by the "
+            f"difference; measure {where_again} again, which decides"
+        )
+    elif result.outliers:
         names = ", ".join(f"{row}/{col}/{number}" for row, col, number in result.outliers)
         lines.append(f"{where}: not used, because they are outliers: {names}; measure them again")
     if result.probability < rare:
@@ -180,6 +188,14 @@ def joint_covariance(panels: Sequence[PanelResult], errors: slice = slice(None))
     """Covariance of piston, tip and tilt of all panels, (3 panels, 3 panels); of ``errors`` among the common ones."""
     common = np.vstack([panel.fit.common[:, errors] for panel in panels])
     return np.asarray(block_diag(*(panel.fit.own_covariance for panel in panels)) + common @ common.T)
+
+
+def _explained(result: PanelResult, one: Explanation) -> str:
+    """An explanation in words: which points are wrong, and whether the panel is bent."""
+    points = result.deviations.points
+    wrong = " and ".join(str(point.point) for point, kept in zip(points, one.is_kept, strict=True) if not kept)
+    parts = ["a bent panel"] if one.has_shape else []
+    return " with ".join([*parts, *([f"wrong points {wrong}"] if wrong else [])])
 
 
 BAND = 0.99

@@ -120,6 +120,12 @@ class ModeFit(NamedTuple):
     dof: int
     common: FloatArray
 
+    def widened(self, spread: FloatArray) -> "ModeFit":
+        """With additional covariance (3, 3) of piston, tip and tilt, the first coefficients."""
+        covariance = self.covariance.copy()
+        covariance[:3, :3] += spread
+        return self._replace(covariance=covariance)
+
     @property
     def own_covariance(self) -> FloatArray:
         """The covariance without the errors that other panels share."""
@@ -223,14 +229,36 @@ def prices(false_alarm: float, points: int, panels: int) -> Prices:
     )
 
 
-def explain(deviations: Deviations, price: Prices) -> tuple[BoolArray, bool]:
-    """The cheapest explanation of a panel's deviations: which points are kept, and whether curvatures are significant.
+class Explanation(NamedTuple):
+    """One explanation of a panel's deviations: points that are kept (k,), whether it is bent, and its cost."""
 
-    All points are kept if the panel cannot be fitted, or has too few redundant points.
+    is_kept: BoolArray
+    has_shape: bool
+    cost: float
+
+    @property
+    def is_plain(self) -> bool:
+        """A rigid panel with all its points."""
+        return bool(self.is_kept.all()) and not self.has_shape
+
+    def extends(self, other: "Explanation") -> bool:
+        """Whether it is the other with more of the same: further points left out, or the curvatures added."""
+        return bool((self.is_kept <= other.is_kept).all()) and self.has_shape >= other.has_shape
+
+
+# Difference of the costs below which the points do not decide: one explanation is less than a thousand times as likely.
+UNDECIDED = 13.8
+
+
+def explain(deviations: Deviations, price: Prices) -> tuple[Explanation, ...]:
+    """The cheapest explanation of a panel's deviations, then others that the points do not exclude.
+
+    All points are kept if the panel cannot be fitted, or has too few redundant points. A plain panel has no others.
     """
     count = len(deviations.points)
     target = deviations.values_m / deviations.sigmas_m
-    best, lowest = (np.ones(count, dtype=np.bool_), False), np.inf
+    plain = Explanation(np.ones(count, dtype=np.bool_), has_shape=False, cost=np.inf)
+    found, lowest = list[Explanation](), np.inf
     for modes, needed in ((rigid, 3), (quadratic, 6)):
         has_shape = modes is quadratic
         extra = price.shape if has_shape else 0.0
@@ -238,12 +266,24 @@ def explain(deviations: Deviations, price: Prices) -> tuple[BoolArray, bool]:
         whitened /= np.linalg.norm(whitened, axis=0)
         for is_kept in _subsets(count, (count - needed) // REDUNDANCY):
             cost = extra + price.outlier * int(np.count_nonzero(~is_kept))
-            if cost >= lowest:
+            if cost >= lowest + UNDECIDED:
                 continue
             cost += _chi2(whitened[is_kept], target[is_kept])
-            if cost < lowest:
-                best, lowest = (is_kept, has_shape), cost
-    return best
+            if cost < lowest + UNDECIDED:
+                found.append(Explanation(is_kept, has_shape, cost))
+            lowest = min(lowest, cost)
+    found.sort(key=lambda one: one.cost)
+    if not found or not np.isfinite(lowest):
+        return (plain,)
+    best = found[0]
+    if best.is_plain:
+        return (best,)
+    others = [one for one in found[1:] if one.cost < lowest + UNDECIDED and not one.is_plain]
+    rivals: list[Explanation] = []
+    for one in others:
+        if not any(one.extends(other) for other in (best, *rivals)):
+            rivals.append(one)
+    return (best, *rivals)
 
 
 def _subsets(count: int, most: int) -> Iterator[BoolArray]:
@@ -385,7 +425,9 @@ class PanelResult:
 
     The adjusters can correct these without bending the panel, and their uncertainty is half of that in a fit with three
     curvatures. ``is_kept`` (k,): the points that are not outliers. ``shape``, and ``bending`` (moves that also remove
-    twist and bowl), are None if there are too few points.
+    twist and bowl), are None if there are too few points. ``alternatives``: other explanations of the deviations that
+    the points do not exclude; the covariances contain the differences. ``deciding``: the point at which the
+    explanations differ most, which measured again decides between them.
     """
 
     panel: PanelId
@@ -397,11 +439,19 @@ class PanelResult:
     adjusters: tuple[str, ...]
     rigid: AdjusterPlan
     bending: AdjusterPlan | None
+    alternatives: tuple[Explanation, ...] = ()
+    deciding: PointId | None = None
 
     @property
     def outliers(self) -> tuple[PointId, ...]:
         """The points left out."""
         return tuple(p for p, kept in zip(self.deviations.points, self.is_kept, strict=True) if not kept)
+
+    @property
+    def explained(self) -> Explanation:
+        """The explanation that was used."""
+        has_shape = self.shape is not None and self.shape.is_significant
+        return Explanation(self.is_kept, has_shape, 0.0)
 
     @property
     def model(self) -> "ModeFit | PanelShape":
@@ -418,13 +468,16 @@ def panel_result(
     mirror: Mirror, panel: PanelId, deviations: Deviations, price: Prices, cos_i: float
 ) -> PanelResult | None:
     """Fit a panel; None if its points do not determine piston, tip and tilt."""
-    kept, has_shape = explain(deviations, price)
+    best, *others = explain(deviations, price)
+    kept, has_shape = best.is_kept, best.has_shape
     places, lever = deviations.places_m[kept], deviations.lever[kept, None]
     values, sigmas = deviations.values_m[kept], deviations.sigmas_m[kept]
     common = None if deviations.common is None else deviations.common[kept]
     fit = fit_modes(lever * rigid(places), values, sigmas, common)
     if fit is None:
         return None
+    spread = _spread(deviations, best, others)
+    fit = fit.widened(spread)
     body = mirror.panel(panel)
     names, adjusters = adjuster_places(mirror, panel)
 
@@ -433,6 +486,7 @@ def panel_result(
         return AdjusterPlan(adjuster_moves(found, modes, adjusters), wavefront)
 
     bent = fit_modes(lever * adjustable(places), values, sigmas, common)
+    bent = None if bent is None else bent.widened(spread)
     full = fit_modes(lever * quadratic(places), values, sigmas, common)
     shape = None
     if full is not None:
@@ -450,7 +504,33 @@ def panel_result(
         adjusters=names,
         rigid=plan(fit, rigid),
         bending=None if bent is None else plan(bent, adjustable),
+        alternatives=tuple(others),
+        deciding=_deciding(deviations, [best, *others]) if others else None,
     )
+
+
+def _fit_of(deviations: Deviations, one: Explanation, modes: Modes) -> ModeFit | None:
+    kept = one.is_kept
+    design = deviations.lever[kept, None] * modes(deviations.places_m[kept])
+    return fit_modes(design, deviations.values_m[kept], deviations.sigmas_m[kept])
+
+
+def _spread(deviations: Deviations, best: Explanation, others: Sequence[Explanation]) -> FloatArray:
+    """Mean square differences (3, 3) of the planes of other explanations from that of the best."""
+    planes = [_fit_of(deviations, one, rigid) for one in (best, *others)]
+    values = np.array([plane.values for plane in planes if plane is not None]).reshape(-1, 3)
+    differences = values[1:] - values[:1]
+    return np.asarray(differences.T @ differences / max(len(differences), 1))
+
+
+def _deciding(deviations: Deviations, explanations: Sequence[Explanation]) -> PointId:
+    """The point at which the surfaces of the explanations differ most."""
+    surfaces = []
+    for one in explanations:
+        modes = quadratic if one.has_shape else rigid
+        if (fit := _fit_of(deviations, one, modes)) is not None:
+            surfaces.append(modes(deviations.places_m) @ fit.values)
+    return deviations.points[int(np.argmax(np.ptp(np.array(surfaces), axis=0)))]
 
 
 def on_grid_m(mirror: Mirror, panel: PanelResult, cells: int) -> tuple[FloatArray, FloatArray, FloatArray]:

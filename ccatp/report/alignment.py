@@ -73,6 +73,14 @@ def panel_data(panel: PanelResult) -> dict[str, Any]:
         "covariance": (panel.fit.covariance * MICRO**2).round(2 * _DECIMALS).tolist(),
         "points": len(found.points),
         "outliers": [point.point for point in panel.outliers],
+        "alternatives": [
+            {
+                "outliers": [p.point for p, kept in zip(found.points, one.is_kept, strict=True) if not kept],
+                "is_bent": one.has_shape,
+            }
+            for one in panel.alternatives
+        ],
+        "deciding_point": panel.deciding and panel.deciding.point,
         "shape": shape
         and {
             "curvature_um_m2": _list(shape.values_1_m),  # xx, xy, yy

@@ -88,7 +88,8 @@ def run_page(found: Findings) -> str:
 def _remarks(panel: PanelResult) -> str:
     left_out = ", ".join(str(point.point) for point in panel.outliers)
     is_bent = panel.shape is not None and panel.shape.is_significant
-    return "; ".join(filter(None, (left_out and f"not used: {left_out}", "bent" if is_bent else "")))
+    again = f"undecided: measure {panel.deciding.point} again" if panel.deciding is not None else ""
+    return "; ".join(filter(None, (again, left_out and f"not used: {left_out}", "bent" if is_bent else "")))
 
 
 def run_drawings(found: Findings) -> dict[str, Draw]:

@@ -193,8 +193,8 @@ def test_noise_makes_neither_outliers_nor_shapes() -> None:
     rng = np.random.default_rng(1)
     found = [explain(on_grid(RIGID + noise(rng)), PRICE) for _ in range(800)]
     # Ten mirrors' worth of panels: 0.1 alarms of either kind are expected.
-    assert sum(not is_kept.all() for is_kept, _ in found) <= 1
-    assert sum(has_shape for _, has_shape in found) <= 1
+    assert sum(not best.is_plain for best, *_ in found) <= 1
+    assert sum(len(one) > 1 for one in found) <= 1
 
 
 @pytest.mark.parametrize("shift_m", [25e-6, -60e-6, 2e-3])
@@ -203,9 +203,10 @@ def test_an_outlier_is_found_wherever_it_is(shift_m: float) -> None:
     for k in range(9):
         values = RIGID + noise(rng)
         values[k] += shift_m
-        is_kept, has_shape = explain(on_grid(values), PRICE)
-        assert [int(i) for i in np.flatnonzero(~is_kept)] == [k]
-        assert not has_shape
+        best, *others = explain(on_grid(values), PRICE)
+        assert [int(i) for i in np.flatnonzero(~best.is_kept)] == [k]
+        assert not best.has_shape
+        assert others == []
 
 
 def test_two_outliers_are_found_wherever_they_are() -> None:
@@ -213,15 +214,43 @@ def test_two_outliers_are_found_wherever_they_are() -> None:
     for pair in combinations(range(9), 2):
         values = RIGID + noise(rng)
         values[list(pair)] += [90e-6, 150e-6]
-        assert np.flatnonzero(~explain(on_grid(values), PRICE)[0]).tolist() == list(pair)
+        found = explain(on_grid(values), PRICE)
+        assert list(pair) in [np.flatnonzero(~one.is_kept).tolist() for one in found if not one.has_shape]
+        assert np.flatnonzero(~found[0].is_kept).tolist() == list(pair)
+
+
+def test_two_equal_outliers_that_a_bent_panel_explains_as_well_are_not_decided() -> None:
+    """Of 36 pairs all have the truth among the explanations, and no move is further off than its sigmas say."""
+    rng = np.random.default_rng(31)
+    undecided, pulls = 0, []
+    for pair in combinations(range(9), 2):
+        measured = exact()
+        for k in pair:
+            measured[k] = shifted(measured[k], 50e-6)
+        for k in range(9):
+            measured[k] = shifted(measured[k], float(rng.normal()) * SIGMA_M)
+        result = result_of(measured)
+        (panel,) = result.panels
+        explained = [panel.explained, *panel.alternatives]
+        assert list(pair) in [np.flatnonzero(~one.is_kept).tolist() for one in explained if not one.has_shape]
+        error = panel.fit.values - np.array([TRUTH.piston_m, TRUTH.tip_rad, TRUTH.tilt_rad])
+        places = adjuster_places(M1, TILTED)[1]
+        pulls.append(np.max(np.abs(rigid(places) @ error) / panel.rigid.moves.sigma_m))
+        if panel.alternatives:
+            undecided += 1
+            assert panel.deciding is not None
+            assert any("do not decide between" in line and "again, which decides" in line for line in result.warnings)
+    # With one number off by its sigma more often than not, five adjusters are within four.
+    assert max(pulls) < 4.0
+    assert 5 <= undecided <= 25
 
 
 def test_a_bent_panel_keeps_its_points() -> None:
     rng = np.random.default_rng(4)
     for _ in range(50):
-        is_kept, has_shape = explain(on_grid(BENT + noise(rng)), PRICE)
-        assert has_shape
-        assert is_kept.all()
+        best, *_ = explain(on_grid(BENT + noise(rng)), PRICE)
+        assert best.has_shape
+        assert best.is_kept.all()
 
 
 @pytest.mark.parametrize("count", [3, 4, 5])
@@ -230,9 +259,8 @@ def test_few_points_accuse_nobody(count: int) -> None:
     some = GRID_M[[0, 2, 6, 8, 4]][:count]
     values = np.zeros(count)
     values[0] = 1e-3
-    is_kept, has_shape = explain(on_grid(values, places_m=some), PRICE)
-    assert is_kept.all()
-    assert not has_shape
+    (best,) = explain(on_grid(values, places_m=some), PRICE)
+    assert best.is_plain
 
 
 # -- half-wavefront error ---------------------------------------------------------------------------------------------
