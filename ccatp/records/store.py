@@ -398,7 +398,7 @@ def _check_file(db: sqlite3.Connection, path: Path, mirror: str) -> None:
     """Raises ``StoreError``, or ``sqlite3.Error``, unless the file is a sound store of this schema and mirror."""
     verdict = db.execute("PRAGMA integrity_check(1)").fetchone()[0]
     if verdict != "ok":
-        raise StoreError(f"{path}: damaged: {verdict}")
+        raise StoreError(f"{path}: damaged: {' '.join(verdict.split())}")
     pages, page_bytes = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size"))
     if path.stat().st_size < pages * page_bytes:  # SQLite fills up a page that is cut off
         raise StoreError(f"{path}: damaged: cut off at {path.stat().st_size} of {pages * page_bytes} bytes")

@@ -220,6 +220,25 @@ def test_a_damaged_recording_gives_what_is_left(recorded: Path, spoilt: Path) ->
     assert len(run.samples("imu")) > 0
 
 
+@pytest.mark.parametrize("part", range(6))
+def test_a_damaged_database_is_one_line_and_the_rest_is_there(recorded: Path, spoilt: Path, part: int) -> None:
+    whole = ccatp.open_run(recorded)
+    assert isinstance(whole, SurveyRun)
+    data = bytearray((recorded / "mission.sqlite").read_bytes())
+    at = part * len(data) // 6
+    data[at : at + 20_000] = b"\x55" * 20_000
+    (spoilt / "mission.sqlite").unlink()
+    (spoilt / "mission.sqlite").write_bytes(data)
+    run = ccatp.open_run(spoilt)
+    assert isinstance(run, SurveyRun)
+    assert run.track().tobytes() == whole.track().tobytes()
+    found = [line for line in run.warnings if line.startswith("mission.sqlite: damaged")]
+    assert "\n" not in "".join(found)
+    # Either it is damaged and nothing of it is used, or the space that is reserved in it was hit.
+    assert (len(run.fixes) == 0) if found else (run.fixes.tobytes() == whole.fixes.tobytes())
+    assert found or part > 0
+
+
 def test_what_is_no_run_and_unknown_names_are_refused(survey: Run, tmp_path: Path, spoilt: Path) -> None:
     with pytest.raises(RunReadError, match="no such directory; name the directory of a run"):
         ccatp.open_run(tmp_path / "none")
