@@ -45,7 +45,7 @@ def consistency(squares: FloatArray, sizes: FloatArray) -> Consistency | None:
 
 
 def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Normalised estimation error squared e^T P^-1 e of each row; errors (n, d), covariances (n, d, d)."""
+    """Normalised estimation error squared e^T P^-1 e of each row, expectation d; of errors (n, d)."""
     solved = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
     squares: FloatArray = np.einsum("ni,ni->n", errors, solved)
     return squares

@@ -168,7 +168,8 @@ def table_lines(run: RecordedRun, data: dict[str, Any]) -> list[str]:
         low, high = data["nis_band"]
         rows.append(("NIS", f"{data['nis_mean']:.3f} per degree of freedom (95 % band {low:.3f} to {high:.3f})"))
     if data["nees_mean"] is not None:
-        rows.append(("NEES", f"{data['nees_mean']:.3f} per degree of freedom"))
+        meaning = "1 expected; more: errors beyond their covariance"
+        rows.append(("NEES", f"{data['nees_mean']:.3f} per degree of freedom ({meaning})"))
     rows.append(("update", _number(data["update_us_p50"], "{:.0f} us a reading") + _parts(data)))
     lines = [f"{name:<12} {text}" for name, text in rows]
     lines += ["", f"{'beacon':<8} {'x_m':>9} {'y_m':>9} {'sigma_x':>8} {'sigma_y':>8} {'error_m':>8}"]
