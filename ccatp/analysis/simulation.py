@@ -14,6 +14,7 @@ from ccatp.analysis.table import table_of_records
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import NO_CAUSE, Cause
+from ccatp.daemon.loops.mission_runner import TimedFrame
 from ccatp.daemon.operator.alarms import LASTING, LEAST_S, active_cause
 from ccatp.links.robot_codec import decode_from_robot, encode
 from ccatp.links.robot_messages import Sensors
@@ -72,12 +73,16 @@ class _ObservedRun(SilRun):
         super()._serve(sensors, dt_s)
         if dt_s <= 0.0:
             return
-        self._sigmas_m.append(self.localizer.position_sigma_m)
         if self._keeps_samples:
             self._lines.append((sensors.seq, sensors.t + self._time.offset_s, encode(sensors)))
         verdict = self._verdict
         if verdict is not None and verdict.cause.condition != self._cause.condition:
             self._note_alarm(verdict.cause, sensors.t)
+
+    def _publish(self, frame: TimedFrame) -> None:
+        """Keep pose and sigma of one moment: a fix later in the frame changes both."""
+        super()._publish(frame)
+        self._sigmas_m.append(self.localizer.position_sigma_m)
 
     def _note_alarm(self, cause: Cause, t_s: float) -> None:
         """The cause of the verdict changed; one that is not severe and passes at once is no alarm, as in the daemon."""

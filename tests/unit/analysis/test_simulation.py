@@ -48,6 +48,14 @@ def test_points_panels_and_samples(run: SurveyRun) -> None:
     assert likeness[0] > 0.9 > likeness[1]  # also in the noise of the hard world, and at no other time
 
 
+def test_pose_and_sigma_of_a_row_belong_to_one_moment(run: SurveyRun) -> None:
+    """A fix moves the pose by many of the sigmas that it leaves."""
+    track = run.track()
+    error_m = np.hypot(track["x_m"] - track["true_x_m"], track["y_m"] - track["true_y_m"])
+    shaken_m = 2e-4  # the body shakes at rest in this world, which no sigma of a place contains
+    assert np.max(error_m - 6.0 * track["sigma_m"]) < shaken_m
+
+
 def test_a_fault_plan_shows_in_the_alarms(tmp_path_factory: pytest.TempPathFactory) -> None:
     plan = tmp_path_factory.mktemp("plan") / "plan.toml"
     fault = '[[fault]]\nsignal = "encoder_{}"\ntype = "off"\nat_s = 70.0\nfor_s = 1.0\n'
