@@ -105,6 +105,12 @@ YAW_DISAGREES = hold("yaw_disagrees", Owner.DANGER, 150, Group.SENSORS,
     "They disagree by more than slip and scale errors explain. The robot takes a fix.",
     "Wheels or mirror oily? Otherwise check the gyroscope.", unit="rad/s",
     then="check the gyroscope; clean wheels and mirror")
+TURN_TIMES_DIFFER = hold("turn_times_differ", Owner.DANGER, 155, Group.SENSORS,
+    "by their time stamps the gyroscope shows turns at least {ms} ms {side} than the encoders",
+    "By regression over the last turns; one of the two has wrong time stamps, so that the heading is wrong whenever a "
+    "turn begins or ends. The robot takes a fix.",
+    "Each sample needs the time at which it was taken: check how the robot stamps both, and filters in the sensors.",
+    unit="s", then="check how the robot stamps the samples of gyroscope and encoders")
 
 # -- fans -------------------------------------------------------------------------------------------------------------
 
@@ -159,8 +165,8 @@ EDGE_SENSOR_STAYS_DARK = slow("edge_sensor_stays_dark", Owner.DANGER, 280, Group
     "It stays off for longer than a pause may last: the edge rule decides, at half the speed.",
     "Clean or replace it. Stray light: cover the place.")
 IMU_LEFT_OUT = slow("imu_left_out", Owner.DANGER, 290, Group.SENSORS, "{what}: left out",
-    "Readings of the inertial unit are impossible (stuck, at their limit, a jump). It is not used: wheels alone, at "
-    "half the speed.", "The accuracy is lower. Replace it if this does not end.")
+    "Readings of the inertial unit are impossible (stuck, at their limit, a jump), or arrive late. It is not used: "
+    "wheels alone, at half the speed.", "The accuracy is lower. Replace it if this does not end.")
 ACCELEROMETER_DIFFERENCES = inform("accelerometer_differences", Owner.DANGER, 300, Group.SENSORS,
     "the accelerometer's samples are single differences, no means: they show contacts as motion",
     "More than twenty jumps in speed within about 20 s that the next sample does not take back. A slide counts with at "

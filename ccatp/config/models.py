@@ -343,6 +343,7 @@ class HealthConfig(Model):
     yaw_limit_rad: Positive
     yaw_share: Annotated[float, Field(ge=0.0, le=1.0)]
     yaw_time_s: Positive
+    turn_delay_s: Positive
     grip_slide_m_s: Positive
     grip_turn_rad: Positive
     identical_samples: Annotated[int, Field(ge=2, le=1000)]

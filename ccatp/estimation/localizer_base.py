@@ -284,7 +284,7 @@ class LocalizerBase(ABC):
             self._resync(t_s, last_s)
         means.take(encoders, dt_s)
         if imu:
-            believed = self._imu_gate.admit(imu, means.yaw_rad_s)
+            believed = self._imu_gate.admit(imu, means.yaw_rad_s, t_s - imu[-1][0] - dt_s)
             if len(believed) != len(imu):
                 self.counts["imu_doubted"] += len(imu)
             imu = believed

@@ -18,6 +18,7 @@ from ccatp.safety.motion_sums import MotionSum
 from ccatp.safety.rate_monitor import RateMonitor
 from ccatp.safety.robot_state_monitors import BATTERY_LOW, BatteryMonitor, FanMonitor, ReportMonitor
 from ccatp.safety.speed_ratio import SpeedRatioMonitor
+from ccatp.safety.turn_timing import TurnTimingMonitor
 from ccatp.safety.wheel_monitor import LATE_S, FrameSpan, WheelMonitor
 from ccatp.sensing.wheel_means import WheelMeans
 
@@ -57,6 +58,7 @@ class HealthMonitor:
         self._battery = self._register(BatteryMonitor(cfg))
         self._seams = self._register(SeamMonitor(cfg, mirror, robot, danger.map_sigmas))
         self._imu = self._register(ImuMonitor(cfg))
+        self._timing = self._register(TurnTimingMonitor(cfg))
         self._reports = self._register(ReportMonitor(cfg))
         self.reset()
 
@@ -87,6 +89,7 @@ class HealthMonitor:
     def jumped(self, t_s: float, by_s: float) -> None:
         """Report that the robot's clock jumped before the frame at ``t_s``."""
         self._imu.reset()
+        self._timing.restart()
         self.findings = [self._link.jumped(t_s, by_s)]
 
     def misdated(self, t_s: float, frame: Sensors) -> None:
@@ -114,13 +117,16 @@ class HealthMonitor:
         dt_s = 0.0 if self._t_s is None else t_s - self._t_s
         self._t_s = t_s
         cmd, imu = frame.cmd, frame.imu
+        age_s = frame.t - imu[-1][0] if imu else 0.0
         is_gap = self._link.step(t_s, dt_s)
         self._means.take(wheels, dt_s)
         if is_permitted and not cmd.held and cmd.age <= LATE_S:
             self._ratio.add(dt_s, self._means.right_rad_s, self._means.left_rad_s)
         else:
             self._ratio.restart()
-        self._sums = self._added(t_s, dt_s, self._imu.step(dt_s, imu, self._means))
+        self._sums = self._added(t_s, dt_s, self._imu.step(dt_s, imu, self._means, age_s))
+        usable = () if self._imu.is_left_out else imu
+        self._timing.step(t_s, usable, wheels, self._means.mean_yaw_rad_s)
         self._counts[0] += len(imu)
         self._counts[1] += len(wheels)
         self._counts[2] += len(edges)

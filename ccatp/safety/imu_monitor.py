@@ -35,10 +35,13 @@ class ImuMonitor(Monitor):
         """Whether the readings are not used."""
         return bool(self._gate.cause)
 
-    def step(self, dt_s: float, imu: Sequence[ImuSample], means: WheelMeans) -> float:
-        """The turn in a frame, rad: 0 while the wheels stand, by them without a usable reading."""
+    def step(self, dt_s: float, imu: Sequence[ImuSample], means: WheelMeans, age_s: float) -> float:
+        """The turn in a frame, rad: 0 while the wheels stand, by them without a usable reading.
+
+        ``age_s``: of the newest sample, at the frame.
+        """
         right, left = means.right_rad_s, means.left_rad_s
-        usable = self._gate.admit(imu, means.yaw_rad_s) if imu else imu
+        usable = self._gate.admit(imu, means.yaw_rad_s, age_s - dt_s) if imu else imu
         if right is None or left is None:
             return 0.0
         if not usable:

@@ -13,6 +13,7 @@ class ImuGate:
 
     Impossible are: an acceleration or rate that the robot cannot reach; a rate that jumps away from that of the wheels
     (``ccatp.safety.wheel_monitor`` judges a slow drift); exact repetition by a unit that has shown noise at rest.
+    Samples that arrive late, with their own times, are not used either: they do not show the present rate.
     While the unit is used, ``cause`` is empty and ``out_since_s`` infinite.
     """
 
@@ -23,6 +24,7 @@ class ImuGate:
         self._jump = cfg.imu_jump_rad_s
         self._acceleration = cfg.imu_acceleration_m_s2
         self._identical = cfg.identical_samples
+        self._late_s = cfg.turn_delay_s
         self._quarantine_s = cfg.imu_quarantine_s
         self.reset()
 
@@ -37,8 +39,11 @@ class ImuGate:
         self.limit = 0.0
         self.out_since_s = inf
 
-    def admit(self, samples: Sequence[ImuSample], yaw_rad_s: float) -> Sequence[ImuSample]:
-        """The usable samples of a frame, oldest first: all or none."""
+    def admit(self, samples: Sequence[ImuSample], yaw_rad_s: float, late_s: float) -> Sequence[ImuSample]:
+        """The usable samples of a frame, oldest first: all or none.
+
+        ``late_s``: time from the newest sample to the frame before this one; negative where a sample is in time.
+        """
         limit = self._rate + self._share * (yaw_rad_s if yaw_rad_s >= 0.0 else -yaw_rad_s)
         is_good = True
         for t_s, ax, wz in samples:
@@ -54,6 +59,8 @@ class ImuGate:
                 self._blame(t_s, "the gyroscope's rate is impossible", off, limit)
             elif not -self._acceleration <= ax <= self._acceleration:
                 self._blame(t_s, "the acceleration is impossible", ax, self._acceleration)
+            elif late_s > self._late_s:
+                self._blame(t_s, "the inertial unit's samples arrive late", late_s, self._late_s)
             elif self._is_noisy and max(self._same_ax, self._same_wz) >= self._identical - 1:
                 repeats = max(self._same_ax, self._same_wz) + 1
                 self._blame(t_s, "the inertial unit repeats itself", repeats, self._identical)

@@ -41,6 +41,12 @@ class WheelMeans:
         share = dt_s / (self._SMOOTH_S + dt_s)
         self.yaw_rad_s += share * (self._per_base * (right_rad_s - left_rad_s) - self.yaw_rad_s)
 
+    @property
+    def mean_yaw_rad_s(self) -> float | None:
+        """The yaw rate by the means of the frame, not smoothed; ``None`` where one is not known."""
+        right, left = self.right_rad_s, self.left_rad_s
+        return None if right is None or left is None else self._per_base * (right - left)
+
     def _take_some(self, right: Sequence[float | None], left: Sequence[float | None]) -> None:
         self.right_rad_s = self._mean(right)
         self.left_rad_s = self._mean(left)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccatp.conditions import text_of
+from ccatp.conditions.danger import IMU_LEFT_OUT, TURN_TIMES_DIFFER
 from ccatp.control.gate import FanGate
 from ccatp.core import Severity
 from ccatp.survey.events import Mode, SurveyOutcome
@@ -28,6 +29,7 @@ PAUSE, HOLD = Severity.PAUSE, Severity.HOLD
 SIDES = ("right", "left")
 RUNAWAYS = {"left_wheel", "encoder_left"}
 ENCODERS = ("encoder_right", "encoder_left")
+INERTIAL = ("imu_ax", "imu_wz")
 EDGES = ("edge_front_left", "edge_front_right", "edge_rear_left", "edge_rear_right")
 
 
@@ -170,6 +172,33 @@ def test_a_sensor_that_chatters_holds(hz: float, measured: Measured) -> None:
     run = watched(HARD, lambda one: one.t_s > DRIVING_S and one.is_zero, fault)
     assert run.seen[-1].t_s - DRIVING_S <= 0.2
     measured("S19", 1e3 * (run.seen[-1].t_s - DRIVING_S))
+
+
+@pytest.mark.fault("S33")
+@pytest.mark.parametrize(
+    ("signals", "by_s"), [(INERTIAL, 0.035), (INERTIAL, 0.05), (INERTIAL, 0.1), (ENCODERS, 0.05), (ENCODERS, 0.1)]
+)
+def test_sensors_with_wrong_time_stamps_hold(signals: tuple[str, ...], by_s: float, measured: Measured) -> None:
+    run = watched(HARD, held(HOLD), *each(signals, f"delayed at_s=0.0 by_s={by_s} stamps='fresh'"))
+    last = run.seen[-1]
+    assert last.verdict.severity is Severity.HOLD
+    assert not run.mission.state.done
+    if signals is INERTIAL:  # encoders that are late also disagree with the set points
+        assert last.verdict.cause.condition == TURN_TIMES_DIFFER.name
+        assert last.verdict.limit < last.verdict.value < by_s + 0.015  # a lower bound: turns hardly last longer
+    turning_s = sum(b.t_s - a.t_s for a, b in pairwise(run.seen) if a.state is Mode.TURNING)
+    measured("S33", turning_s)
+    assert turning_s < 2.0
+
+
+@pytest.mark.fault("S34")
+@pytest.mark.parametrize("by_s", [0.05, 0.1])
+def test_inertial_samples_that_arrive_late_are_left_out(by_s: float, measured: Measured) -> None:
+    late = each(INERTIAL, f"delayed at_s={DRIVING_S} by_s={by_s} stamps='old'")
+    run = watched(HARD, lambda one: slow(one) and one.t_s > DRIVING_S, *late)
+    assert run.seen[-1].verdict.cause.condition == IMU_LEFT_OUT.name
+    measured("S34", 1e3 * (run.seen[-1].t_s - DRIVING_S))
+    assert run.seen[-1].t_s - DRIVING_S < 0.25
 
 
 @pytest.mark.fault("S24")

@@ -130,11 +130,29 @@ class Scripted:
 SPEED_RAD_S = 3.0
 SPEED = (SPEED_RAD_S, SPEED_RAD_S)
 TURN_RAD_S = 0.55  # of a body with one wheel at that speed and the other at rest, about
+PER_WHEEL = 2.0 * TURN_RAD_S / SPEED_RAD_S  # of a body whose wheels turn against each other, per rate of one
 
 
 def drives(frame: Frame) -> dict[str, Any]:
     """Straight on at one speed, with the set points of it."""
     return {"rates": SPEED, "commanded": (SPEED_RAD_S,) * 4} if frame.t_s > 0.5 else {}
+
+
+def turns(frame: Frame, late_frames: int = 0) -> dict[str, Any]:
+    """Turns on the spot to one side and to the other, with the set points of them."""
+    right, late = _turn_at(frame.number), _turn_at(frame.number - late_frames)
+    return {"rates": (right, -right), "commanded": (right, right, -right, -right), "wz_rad_s": PER_WHEEL * late}
+
+
+def late_gyroscope(frame: Frame) -> dict[str, Any]:
+    return turns(frame, late_frames=6)
+
+
+def _turn_at(frame: int) -> float:
+    """The right wheel's rate: a second of speeding up and slowing down, then as long a rest, and back."""
+    at = frame % 400
+    share = max(0.0, 1.0 - abs(at % 200 - 50) / 50)
+    return SPEED_RAD_S * share * (1.0 if at < 200 else -1.0)
 
 
 def stands(_: Frame) -> dict[str, Any]:
@@ -190,6 +208,10 @@ ROWS = [
     Row(rows.WHEEL_CREEPS_ON, always(rates=(0.1, 0.0)), cause="the right wheel turns while it is held"),
     Row(rows.WHEEL_DOES_NOT_STOP, always(rates=(0.0, 0.5)), signal="left_wheel", lasts=False),
     Row(rows.YAW_DISAGREES, always(wz_rad_s=0.4), drives, signal="imu_wz"),
+    Row(
+        rows.TURN_TIMES_DIFFER, late_gyroscope, turns, cause="the gyroscope shows turns", signal="imu_wz", clears_s=9.0,
+        lasts=False
+    ),
     Row(rows.FAN_TOO_LITTLE, always(fans=(0.1, 1.0)), cause="the left fan gives too little", mirror="fyst-m2"),
     Row(rows.FAN_WEAK, always(fans=(1.0, 0.7)), cause="the right fan gets weak", mirror="fyst-m2"),
     Row(rows.FAN_REPORTED, always(faults=("fan_left",)), cause="a fault of its left fan", mirror="fyst-m2"),

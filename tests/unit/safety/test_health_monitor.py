@@ -45,7 +45,7 @@ def unregistered(health: HealthMonitor, classes: Iterator[type]) -> set[type]:
 
 def test_every_monitor_of_the_package_is_registered(health: HealthMonitor) -> None:
     assert unregistered(health, classes_of_the_package()) == set()
-    assert len(health.monitors) == 12
+    assert len(health.monitors) == 13
 
 
 def test_a_monitor_that_is_not_registered_is_noticed(health: HealthMonitor) -> None:
@@ -103,7 +103,7 @@ def test_a_reset_makes_every_monitor_like_a_new_one(config: Config, mirror: Mirr
         t_s = 0.01 * seq + 0.5 * (seq // 200)
         rates = rng.uniform(-3.0, 3.0, 2).tolist() if seq > 100 else (0.0, 0.0)
         enc = [WheelSample(t_s, *rates)] * (1 + 9 * (seq < 300))
-        imu = [ImuSample(t_s - 0.001 * k, *rng.normal(0.0, 0.01, 2).tolist()) for k in range(5)]
+        imu = [ImuSample(t_s - 0.001 * k, *rng.normal(0.0, 0.01, 2).tolist()) for k in range(4, -1, -1)]
         imu = [*imu, ImuSample(t_s, 4.0, 9.0 * (seq > 400))]
         edge = [EdgeSample(t_s, *rng.integers(0, 2, 4).tolist())]
         echo, faults = CommandEcho(seq - 30, 0.3 * (seq > 500), 0.0, False), ["stall", "fan_left"]
