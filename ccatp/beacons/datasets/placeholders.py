@@ -44,7 +44,7 @@ def measured(kind: str, table: Table, warnings: list[str]) -> Table:
         line = f"beyond {most:g} {unit}, the first {values[first]:.3g} {unit} at {table.values[first, 0]:.6g} s"
         warnings.append(f"{plural(int(beyond.sum()), WHAT[kind])} {line}, not used")
         table = table.where(~beyond)
-    for value in _placeholders(kind, table.values[:, 1], table.values[:, 2]):
+    for value in placeholder_values(kind, table.values[:, 1], table.values[:, 2]):
         is_it = table.values[:, 2] == value
         first = int(np.argmax(is_it))
         warnings.append(
@@ -56,7 +56,8 @@ def measured(kind: str, table: Table, warnings: list[str]) -> Table:
     return table
 
 
-def _placeholders(kind: str, beacons: FloatArray, values: FloatArray) -> list[float]:
+def placeholder_values(kind: str, beacons: FloatArray, values: FloatArray) -> list[float]:
+    """Values that stand for no measurement. ``beacons``: number of the beacon of each value, shape (n,)."""
     found = [value for value in NOTHING.get(kind, ()) if (values == value).any()]
     if kind not in KNOWN:
         return found

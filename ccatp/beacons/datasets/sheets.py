@@ -16,7 +16,8 @@ import tomlkit
 
 from ccatp.beacons.cricket.measured_map import MeasuredRanges
 from ccatp.beacons.cricket.range_network import MoteRange
-from ccatp.beacons.datasets.tables import RadioDataError, content_lines, number, read_text, split_cells
+from ccatp.beacons.datasets.placeholders import placeholder_values
+from ccatp.beacons.datasets.tables import RadioDataError, content_lines, number, plural, read_text, split_cells
 from ccatp.beacons.estimation.level_fix import MeasuredPlace
 from ccatp.beacons.estimation.path_loss import LevelPair
 from ccatp.config.files import read_input
@@ -47,16 +48,21 @@ class Sheet(NamedTuple):
             raise RadioDataError(self.path, f"has no column of {what}; its columns are {', '.join(self.head)}", 1)
         return found
 
-    def numbers(self, *columns: int) -> list[list[float]]:
-        """The numbers in some columns, row by row.
+    def numbers(self, *columns: int, may_lack: Sequence[int] = ()) -> list[list[float]]:
+        """The numbers in some columns, row by row; NaN for an empty cell in those of ``may_lack``.
 
         Raises RadioDataError: a cell is not a number, or too large for a level or a coordinate.
         """
         found = []
         for line, row in self.rows:
-            values = [number(self.path, line, row[column], f"column {column + 1}") for column in columns]
+            values = [
+                np.nan
+                if column in may_lack and not row[column]
+                else number(self.path, line, row[column], f"column {column + 1}")
+                for column in columns
+            ]
             for column, value in zip(columns, values, strict=True):
-                if not abs(value) <= _LARGEST:
+                if not abs(value) <= _LARGEST and not (column in may_lack and not row[column]):
                     what = f"{value:g} in column {column + 1} is no level and no place, m"
                     raise RadioDataError(self.path, what, line)
             found.append(values)
@@ -144,9 +150,11 @@ def read_levels(path: Path, sheet: str | None = None, points: Path | None = None
     if path.is_dir():
         return _read_logs(path, sheet, points)
     table = read_sheet(path, sheet)
-    numbers = table.numbers(table.column(_DISTANCE, _DISTANCES), table.column(_LEVEL, "levels, as rssi_dbm"))
-    levels, warnings = _signed([level for _, level in numbers])
-    return table.name, tuple(LevelPair(r_m, z) for (r_m, _), z in zip(numbers, levels, strict=True)), warnings
+    level = table.column(_LEVEL, "levels, as rssi_dbm")
+    numbers = np.array(table.numbers(table.column(_DISTANCE, _DISTANCES), level, may_lack=(level,)))
+    levels, warnings = _heard(numbers[:, 1:])
+    rows = zip(numbers[:, 0].tolist(), levels[:, 0].tolist(), strict=True)
+    return table.name, tuple(LevelPair(r_m, z) for r_m, z in rows if not np.isnan(z)), warnings
 
 
 def read_level_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
@@ -159,12 +167,16 @@ def read_level_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
     at = [table.column(re.compile(rf"^{axis}(_m)?$", re.IGNORECASE), f"places, as {axis}") for axis in "xy"]
     if not nodes:
         raise RadioDataError(path, 'has no column of levels by node; name one "RSSI A" for each node')
-    numbers = table.numbers(*at, *nodes.values())
-    levels, warnings = _signed([level for row in numbers for level in row[2:]])
-    rows = np.reshape(levels, (-1, len(nodes))).tolist()
-    places = zip(numbers, rows, strict=True)
-    found = tuple(MeasuredPlace((place[0], place[1]), dict(zip(nodes, row, strict=True))) for place, row in places)
-    return table.name, found, warnings
+    numbers = np.array(table.numbers(*at, *nodes.values(), may_lack=tuple(nodes.values())))
+    levels, warnings = _heard(numbers[:, 2:])
+    found = []
+    for (x_m, y_m), row in zip(numbers[:, :2].tolist(), levels.tolist(), strict=True):
+        heard = {node: level for node, level in zip(nodes, row, strict=True) if not np.isnan(level)}
+        if heard:
+            found.append(MeasuredPlace((x_m, y_m), heard))
+    if len(found) < len(numbers):
+        warnings.append(f"{plural(len(numbers) - len(found), 'place')} where no node was heard, not used")
+    return table.name, tuple(found), warnings
 
 
 def read_log(file: Path) -> dict[str, list[float]]:
@@ -199,10 +211,17 @@ def _read_logs(folder: Path, sheet: str | None, points: Path | None) -> Levels:
     return f"{folder.name}, distances of {table.name}", tuple(pairs), warnings
 
 
-def _signed(levels: list[float]) -> tuple[list[float], list[str]]:
-    if levels and min(levels) > 0.0:
-        return [-level for level in levels], ["all levels are positive: taken for dBm without their sign"]
-    return levels, []
+def _heard(levels: FloatArray) -> tuple[FloatArray, list[str]]:
+    """Levels in dBm, shape (n, nodes), NaN for nodes that were not heard, and warnings."""
+    levels, warnings = levels.copy(), []
+    node = np.broadcast_to(np.arange(levels.shape[1]), levels.shape)[np.isfinite(levels)]
+    for value in placeholder_values("rssi", node.astype(np.float64), levels[np.isfinite(levels)]):
+        is_it = levels == value
+        warnings.append(f"{plural(int(is_it.sum()), 'level')} of {value:g} dBm stand for nodes not heard, not used")
+        levels[is_it] = np.nan
+    if np.isfinite(levels).any() and np.nanmin(levels) > 0.0:
+        return -levels, [*warnings, "all levels are positive: taken for dBm without their sign"]
+    return levels, warnings
 
 
 PLAIN = ("first", "second", "range_m")

@@ -19,6 +19,7 @@ from ccatp.beacons.datasets.sheets import (
     write_beacons,
 )
 from ccatp.beacons.datasets.tables import RadioDataError
+from ccatp.beacons.estimation.level_fix import MeasuredPlace
 
 
 def text(folder: Path, content: str, name: str = "a.csv") -> Path:
@@ -79,6 +80,17 @@ def test_places_with_levels_by_node(tmp_path: Path) -> None:
     _, places, _ = read_level_places(text(tmp_path, "Point,x,y,RSSI A,RSSI B\n1,0.5,1,56,60\n2,1,0,57,61\n"))
     assert places[1].place_m == (1.0, 0.0)
     assert places[0].levels_dbm == {"A": -56.0, "B": -60.0}
+
+
+def test_a_node_that_was_not_heard_is_an_empty_cell_or_a_placeholder(tmp_path: Path) -> None:
+    rows = [f"{k},0,{-40 - k},{-70 + k}" for k in range(12)]
+    rows += ["12,0,100,-60", "13,0,,-61", "14,0,100,", "15,0,100,-62"]
+    _, places, warnings = read_level_places(text(tmp_path, "x,y,RSSI A,RSSI B\n" + "\n".join(rows) + "\n"))
+    assert places[-2].levels_dbm == {"B": -61.0}
+    assert places[-1] == MeasuredPlace((15.0, 0.0), {"B": -62.0})
+    assert len(places) == 15
+    assert warnings[0] == "3 levels of 100 dBm stand for nodes not heard, not used"
+    assert warnings[1] == "1 place where no node was heard, not used"
 
 
 def test_a_folder_of_logs_with_their_distances(tmp_path: Path) -> None:
