@@ -3,7 +3,7 @@
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
-from tests.unit.beacons.datasets.attack import ATTACKS, attacked
+from tests.fuzz.radio_attacks import ATTACKS, attacked
 
 SEEDS = (0, 1, 2)
 OF_TRUTH = [name for name in ATTACKS if "truth" in name]
