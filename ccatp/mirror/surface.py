@@ -30,6 +30,15 @@ _NEWTON_STEPS = 20
 _NEWTON_STEP_M = 1e-12  # Newton converges quadratically, so after such a step the error is at rounding level
 
 
+def tangent_axes(fx: float, fy: float) -> Axes:
+    """As ``Surface.axes``, from the slopes."""
+    s2 = 1.0 + fx * fx
+    s = sqrt(s2)
+    w = sqrt(s2 + fy * fy)
+    ws = w * s
+    return (1.0 / s, 0.0, fx / s), (-fx * fy / ws, s / w, fy / ws), (-fx / w, -fy / w, 1.0 / w)
+
+
 class Surface:
     """Height of the ideal mirror over the deck plane, ``f(x, y) = sum c_ij x^i y^j`` (thesis eq. 1.1, deck frame, m).
 
@@ -130,12 +139,7 @@ class Surface:
 
         ``e1 = (1, 0, fx)/sqrt(1 + fx^2)`` is the tangent of the line y = const towards +x, n the normal, e2 = n x e1.
         """
-        fx, fy = self.gradient(x, y)
-        s2 = 1.0 + fx * fx
-        s = sqrt(s2)
-        w = sqrt(s2 + fy * fy)
-        ws = w * s
-        return (1.0 / s, 0.0, fx / s), (-fx * fy / ws, s / w, fy / ws), (-fx / w, -fy / w, 1.0 / w)
+        return tangent_axes(*self.gradient(x, y))
 
     def drop(self, start: Vector3, direction: Vector3) -> Vector3:
         """Point where the line ``start + s direction`` meets the surface near s = 0; raises ``ConvergenceError``."""

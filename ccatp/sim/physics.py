@@ -10,15 +10,17 @@ alone, without random numbers.
 Slip, creep, load and loss of grip result from the contacts, so the disturbances of the kinematic worlds are not used.
 """
 
-from math import atan2
+from collections import deque
+from math import atan2, pi
 from typing import Any
 
 import numpy as np
 
 from ccatp.config.models import Config, PhysicsConfig
-from ccatp.core import GRAVITY_M_S2, DeckPose, FloatArray
+from ccatp.core import GRAVITY_M_S2, DeckPose
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.surface import Axes, tangent_axes
 from ccatp.sim.hardware import Motor, SimulatedHardware
 from ccatp.sim.plant import Plant
 from ccatp.sim.world import World
@@ -85,11 +87,18 @@ class PhysicsPlant(Plant):
         self._mirror, self._surface = mirror, mirror.surface
         self._model = self._build(cfg.sim.physics, robot.wheel_radius_m, robot.wheel_base_m)
         self._data = mujoco.MjData(self._model)
-        self._body = self._model.body("robot").id
+        body = self._model.body("robot").id
+        # Views of MuJoCo's memory: to make one takes as long as to read it.
+        data = self._data
+        self._torques, self._force, self._rotation = data.ctrl, data.xfrc_applied[body, :3], data.xmat[body]
+        self._place, self._angles, self._rates = data.xpos[body], data.qpos[7:9], data.qvel
+        self._ahead_and_left, self._velocity = self._rotation.reshape(3, 3)[:, :2].T, data.qvel[:3]
+        self._ground_m, self._ground_turn = self._model.geom_pos[0], self._model.geom_quat[0]
+        self._ground_axes = np.zeros(9)
         self.thrust_n = 0.0
         self.has_left = False
         self._averaged = max(1, round(cfg.sim.physics.accelerometer_s / step_s))
-        self._speeds = [(0.0, 0.0)] * (self._averaged + 1)
+        self._speeds = deque([[0.0, 0.0]] * (self._averaged + 1), self._averaged + 1)
         self._rate_rad_s = 0.0
         self.place(start.x_m, start.y_m, start.heading_rad)
         self.are_wheels_still = False
@@ -122,10 +131,11 @@ class PhysicsPlant(Plant):
     def step(self, t_s: float, dt_s: float, right_set_rad_s: float, left_set_rad_s: float) -> None:
         """Advance by ``dt_s`` with constant voltages of the (right, left) motor, V."""
         data, motor = self._data, self._motor
-        data.ctrl[:] = right_set_rad_s / motor.volt_per_nm, left_set_rad_s / motor.volt_per_nm
+        self._torques[:] = right_set_rad_s / motor.volt_per_nm, left_set_rad_s / motor.volt_per_nm
         self._right_angle_0, self._left_angle_0 = self.right_angle_rad, self.left_angle_rad
         x, y, heading_rad = self.x_m, self.y_m, self.heading_rad
-        data.xfrc_applied[self._body, :3] = -self.thrust_n * data.xmat[self._body].reshape(3, 3)[:, 2]
+        _, _, nx, _, _, ny, _, _, nz = self._rotation.tolist()
+        self._force[:] = -self.thrust_n * nx, -self.thrust_n * ny, -self.thrust_n * nz
         self._mujoco.mj_step(self._model, data)
         self._read_state()
         dx, dy = self.x_m - x, self.y_m - y
@@ -137,32 +147,28 @@ class PhysicsPlant(Plant):
         # Rest is never exact, so the body always counts as moving; the edge sensors add up the small displacements.
         self.is_moving = True
 
-    def _lay_ground(self) -> None:
+    def _lay_ground(self, axes: Axes) -> None:
         """Move the ground to the tangent plane under the robot (impossible for a plane at the model's origin)."""
-        self._model.geom_pos[0] = self.x_m, self.y_m, self.z_m
-        axes = np.array(self._surface.axes(self.x_m, self.y_m)).T
-        self._mujoco.mju_mat2Quat(self._model.geom_quat[0], axes.ravel())
+        self._ground_m[:] = self.x_m, self.y_m, self.z_m
+        e1, e2, normal = axes
+        self._ground_axes[:] = e1[0], e2[0], normal[0], e1[1], e2[1], normal[1], e1[2], e2[2], normal[2]
+        self._mujoco.mju_mat2Quat(self._ground_turn, self._ground_axes)
 
     def _read_state(self) -> None:
-        data = self._data
-        rotation: FloatArray = data.xmat[self._body].reshape(3, 3)
-        x, y, z = data.xpos[self._body].tolist()
+        x, y, z = self._place.tolist()
         self.x_m, self.y_m = x, y
         self.z_m, self.fx, self.fy, *_ = self._surface.jet(x, y)
         self.has_left = z - self.z_m > 0.03
-        (e1x, _, e1z), (e2x, e2y, e2z), _ = self._surface.axes(x, y)
-        ax, ay, az = rotation[:, 0].tolist()
+        axes = (e1x, _, e1z), (e2x, e2y, e2z), _ = tangent_axes(self.fx, self.fy)
+        ax, _, _, ay, _, _, az, _, _ = self._rotation.tolist()
         heading = atan2(ax * e2x + ay * e2y + az * e2z, ax * e1x + az * e1z)
-        turned = (heading - self.heading_rad + np.pi) % (2.0 * np.pi) - np.pi
+        turned = (heading - self.heading_rad + pi) % (2.0 * pi) - pi
         self.heading_rad += turned
         self._turn_axes()
-        self._lay_ground()
-        right, left = data.qpos[7:9].tolist()
-        self.right_angle_rad, self.left_angle_rad = right, left
-        self.right_rad_s, self.left_rad_s = data.qvel[6:8].tolist()
-        ahead, left = (rotation[:, :2].T @ data.qvel[:3]).tolist()
-        self._speeds = [*self._speeds[1:], (ahead, left)]
-        self._rate_rad_s = float(data.qvel[5])
+        self._lay_ground(axes)
+        self.right_angle_rad, self.left_angle_rad = self._angles.tolist()
+        *_, self._rate_rad_s, self.right_rad_s, self.left_rad_s = self._rates.tolist()
+        self._speeds.append((self._ahead_and_left @ self._velocity).tolist())
 
     def acceleration_at(self, decay: float) -> float:
         """Mean acceleration along robot x over ``sim.physics.accelerometer_s``, m/s^2."""
