@@ -7,10 +7,12 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import reduce
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import click
@@ -25,6 +27,8 @@ _NOT_WRITTEN = (errno.ENOSPC, errno.EIO, errno.EBADF)  # full device, closed ter
 RENAMED_COMMANDS = {"log": "recording", "recover": "repair", "map": "plot"}
 # Longer than any answer takes; libzmq accepts a time-out as an int in milliseconds.
 LONGEST_WAIT_S = 86_400.0
+# After which a command says that it works.
+PATIENCE_S = 2.0
 
 
 PATH = click.Path(path_type=Path)
@@ -212,6 +216,32 @@ def warn(warnings: Iterable[str]) -> None:
     """A line on standard error for each warning."""
     for warning in warnings:
         complain(f"warning: {one_line(warning)}", 0)
+
+
+@contextmanager
+def working(what: str) -> Iterator[None]:
+    """On a terminal, say after two seconds that a command works, and for how long; the line goes when it is done."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    is_done = Event()
+
+    def tell() -> None:
+        begun_s = time.monotonic()
+        line = ""
+        while not is_done.wait(1.0 if line else PATIENCE_S):
+            line = f"ccatp: {printable(what)}, {time.monotonic() - begun_s:.0f} s"
+            click.echo(f"\r{line}", nl=False, err=True)
+        if line:
+            click.echo(f"\r{' ' * len(line)}\r", nl=False, err=True)
+
+    teller = Thread(target=tell, daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        is_done.set()
+        teller.join()
 
 
 def print_lines(lines: Iterable[str]) -> None:

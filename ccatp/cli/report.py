@@ -38,9 +38,10 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, tables: Path |
     Panel alignment, quality of the measurement, use of the time, events. It takes runs that are
     finished, running, killed or resumed, and says what is missing.
     """
-    from ccatp.report.run_page import report_run
+    with common.working(f"reading and drawing {run_dir}"):
+        from ccatp.report.run_page import report_run
 
-    data, warnings = report_run(run_dir, out, figures, tables)
+        data, warnings = report_run(run_dir, out, figures, tables)
     common.warn(warnings)
     click.echo(json.dumps(data) if json_output else data["report"])
     return 0
@@ -54,10 +55,11 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, tables: Path |
 @_JSON
 def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
     """Compare two runs: figures, configuration, time, errors, and which panels have moved."""
-    from ccatp.report.compare import COMPARISON, compare_data, compare_lines, compare_runs
+    with common.working(f"reading and drawing {run_a} and {run_b}"):
+        from ccatp.report.compare import COMPARISON, compare_data, compare_lines, compare_runs
 
-    path = out or run_b / COMPARISON
-    pair = compare_runs(run_a, run_b, path, figures)
+        path = out or run_b / COMPARISON
+        pair = compare_runs(run_a, run_b, path, figures)
     for found in (pair.a, pair.b):
         common.warn(f"{found.record.name}: {warning}" for warning in found.record.warnings)
     data = {"report": str(path), **compare_data(pair)}
@@ -74,10 +76,12 @@ def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, js
 )
 def plot(run_dir: Path, out: Path | None) -> int:
     """Draw the map of a run: panels, path, and each point coloured by its arrival error."""
-    from ccatp.report.mirror_map import draw_from_run_dir
-
     picture = out or run_dir / "map.png"
-    common.warn(draw_from_run_dir(run_dir, picture))
+    with common.working(f"reading and drawing {run_dir}"):
+        from ccatp.report.mirror_map import draw_from_run_dir
+
+        warnings = draw_from_run_dir(run_dir, picture)
+    common.warn(warnings)
     click.echo(picture)
     return 0
 
