@@ -54,6 +54,8 @@ def run(
         raise click.UsageError("--start-held needs --resume; --resume-last always starts held")
     if recover and (resume or run_dir is not None):
         raise click.UsageError("--resume-last finds the run itself: leave out --resume and --run-dir")
+    if not sim and config_file is None and not resume:
+        raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
     from ccatp.daemon.supervision.fork_server import ForkServer
     from ccatp.daemon.supervision.open_files import permit_open_files
 
@@ -66,8 +68,6 @@ def run(
         run_dir = find_unfinished()
     if resume and config_file is None and run_dir is not None:
         config_file = run_dir / "config.toml"
-    if not sim and config_file is None:
-        raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
     from ccatp.daemon.supervision.supervisor import run as run_to_the_end
 
     if faults_file is not None:

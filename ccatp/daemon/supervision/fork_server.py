@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import NamedTuple, Protocol, Self
 
 from ccatp.config.package import child_environment
@@ -35,6 +35,7 @@ FIRST_TIMEOUT_S, TIMEOUT_S = 20.0, 2.0
 # Longest pause between two looks for the end of a process.
 LONGEST_PAUSE_S = 0.01
 PR_SET_CHILD_SUBREAPER = 36
+STDERR = 2  # file descriptor
 REQUEST_BYTES = 65_536
 MOST_DESCRIPTORS = 16
 # Room for the command line of a forked process, which takes the place of the server's own.
@@ -76,7 +77,7 @@ def start_module(module: str, arguments: Sequence[str], fds: Sequence[int] = ())
     return subprocess.Popen(
         [sys.executable, "-m", module, *arguments],
         stdin=subprocess.DEVNULL,
-        stdout=sys.stderr,
+        stdout=STDERR,
         pass_fds=fds,
         start_new_session=True,
         env=environment_of_children(os.environ),
@@ -130,11 +131,13 @@ class ForkServer:
     """The server of one supervisor, from construction to ``close``; it imports while the supervisor does."""
 
     def __init__(self) -> None:
-        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._timeout_s = FIRST_TIMEOUT_S
-        with theirs:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs, ExitStack() as unless_started:
+            unless_started.callback(ours.close)
             arguments = (str(theirs.fileno()), " " * COMMAND_LINE_BYTES)
             self._server = start_module(MODULE, arguments, (theirs.fileno(),))
+            unless_started.pop_all()
+        self._control, self._timeout_s = ours, FIRST_TIMEOUT_S
         _adopt_orphans(True)
 
     @property

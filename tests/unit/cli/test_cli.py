@@ -5,6 +5,7 @@ import importlib.metadata
 import json
 import sys
 from collections.abc import Callable, Iterator
+from io import StringIO
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,13 +15,14 @@ import pytest
 
 import ccatp
 from ccatp.cli import cli, main
-from ccatp.cli.common import configured_folder, parse_setting
+from ccatp.cli.common import configured_folder, parse_setting, working
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.daemon.supervision.run_dir import RunOptions
 from ccatp.errors import ConfigError, DaemonUnreachableError, RefusedError
 from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
 from tests.support.command import answered, printed, refused
+from tests.support.runs import until
 from tests.unit.links.test_auth import serving
 
 EMERGENCY_ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
@@ -110,13 +112,14 @@ def test_run_hands_over_what_was_asked_for_and_nothing_else(stub: Stub, tmp_path
         sim=True, overrides=overrides, realtime=True, run_dir=tmp_path, json_output=True, runtime_dir=Path("/run/x")
     )
     assert main(["run", "--config", "mine.toml"]) == 3
-    assert calls == [(asked,), (RunOptions(sim=False, config_file=Path("mine.toml")),)]
+    assert [options for options, _ in calls] == [asked, RunOptions(sim=False, config_file=Path("mine.toml"))]
+    assert all(server.start("time", []) is None for _, server in calls)  # each has ended with its command
 
 
 def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> None:
     calls = stub("ccatp.daemon.supervision.supervisor", "run", 0)
     assert main(["run", "--sim", "--resume", "--run-dir", "runs/a"]) == 0
-    (options,) = calls[0]
+    options, _ = calls[0]
     assert (options.config_file, options.run_dir, options.resume) == (Path("runs/a/config.toml"), Path("runs/a"), True)
 
 
@@ -333,3 +336,33 @@ def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.Capture
 )
 def test_settings_are_toml_or_text(text: str, setting: tuple[str, object]) -> None:
     assert parse_setting(text) == setting
+
+
+# -- commands that take long -------------------------------------------------------------------------------------------
+
+
+class Terminal(StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("stream", "said"), [(Terminal, True), (StringIO, False)])
+def test_a_command_that_takes_long_says_so_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, stream: type[StringIO], said: bool
+) -> None:
+    screen = stream()
+    monkeypatch.setattr(sys, "stderr", screen)
+    monkeypatch.setattr("ccatp.cli.common.PATIENCE_S", 0.01)
+    with working("reading runs/tonight"):
+        until(lambda: screen.getvalue() or not said)
+    shown = "\rccatp: reading runs/tonight, 0 s"
+    assert screen.getvalue().startswith(shown) is said
+    assert screen.getvalue().endswith(f"\r{' ' * len(shown[1:])}\r") is said  # nothing of it is left
+
+
+def test_a_command_that_is_done_soon_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stderr", screen)
+    with working("reading runs/tonight"):
+        pass
+    assert screen.getvalue() == ""
