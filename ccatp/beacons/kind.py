@@ -23,7 +23,7 @@ BEACONS = MissionKind(
     conditions="ccatp.beacons.conditions",
     waits={
         "mapping": "waits until the motes have measured each other, then drives to the first waypoint",
-        "visiting": "stands for a moment before the move or until the danger loop permits it, then goes on by itself",
+        "visiting": "stands for a moment before the move or until the danger loop permits it, then continues by itself",
         "following": "waits until the target moves away, then follows it",
     },
     stands=("mapping",),

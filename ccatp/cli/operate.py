@@ -51,6 +51,17 @@ def _user() -> str:
         return str(os.getuid())
 
 
+# What the ways to end a survey have in common and not, in the help of each.
+_COMPARED = """
+
+\b
+abort      the robot drives home; the run ends there, status 3
+stop       the robot stays where it is; the run ends at once, status 4
+emergency  the robot drives home, or stands in an earthquake; latched until the observatory clears it
+pause      the robot stays where it is; the run goes on with resume
+"""
+
+
 def _operator_command(name: str, help_text: str) -> click.Command:
     @click.command(name, help=help_text, epilog=common.example(f"ccatp {name}"))
     @DAEMON_OPTIONS
@@ -61,10 +72,10 @@ def _operator_command(name: str, help_text: str) -> click.Command:
     return command
 
 
-pause = _operator_command("pause", "Stop the robot where it is, until resume.")
-resume = _operator_command("resume", "Continue after a pause.")
-abort = _operator_command("abort", "Give up the survey and drive the robot to its base.")
-stop = _operator_command("stop", "Hold the wheels where the robot is, save, and end the daemon.")
+pause = _operator_command("pause", f"Stop the robot where it is, until resume.{_COMPARED}")
+resume = _operator_command("resume", "Continue after a pause, or after a fault whose cause is gone.")
+abort = _operator_command("abort", f"Give up the survey and drive the robot to its base.{_COMPARED}")
+stop = _operator_command("stop", f"Hold the wheels where the robot is, save, and end the daemon.{_COMPARED}")
 
 OBSERVATORY_OPTIONS = common.options(
     click.option("--endpoint", metavar="tcp://HOST:PORT", help="A daemon on another machine, by its TCP endpoint."),
@@ -77,6 +88,8 @@ OBSERVATORY_OPTIONS = common.options(
 @common.command(
     "ccatp emergency fire --note 'smoke in the receiver cabin'",
     "ccatp emergency fire --endpoint tcp://m1:7020 --server-key ccatp.key --key observatory.key_secret",
+    help="Send the robot to its base because of an emergency, which is latched until it is cleared.\n\n"
+    f"KIND is fire, earthquake, power, weather or operator.{_COMPARED}",
 )
 @click.argument("kind", type=click.Choice(EMERGENCY_KINDS), metavar="KIND")
 @click.option("--note", default="", help="What happened, for the log.")
@@ -85,10 +98,7 @@ OBSERVATORY_OPTIONS = common.options(
 )
 @OBSERVATORY_OPTIONS
 def emergency(kind: str, note: str, emergency_id: uuid.UUID | None, json_output: bool, **where: Any) -> None:
-    """Report an emergency: the robot goes to its base.
-
-    KIND is fire, earthquake, power, weather or operator.
-    """
+    """Report an emergency."""
     payload = {"cmd": "emergency", "kind": kind, "id": str(emergency_id or uuid.uuid4()), "note": note}
     _print_reply(_ask_observatory(payload, **where), json_output)
 
@@ -210,7 +220,12 @@ def status(
         from ccatp.daemon.supervision.child_processes import page_address
         from ccatp.links.runtime_dir import runtime_dir_path
 
-        reply = _ask(folder, "status", timeout_s)
+        try:
+            reply = _ask(folder, "status", timeout_s)
+        except DaemonUnreachableError as error:
+            if json_output:  # whoever reads the answer gets one
+                click.echo(json.dumps({"ok": False, "error": str(error)}))
+            raise
         _print_reply(reply, json_output, page_address(runtime_dir_path(str(folder or ""), os.environ)))
         return
     answers = _answers(folder, timeout_s, period_s)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -31,9 +32,12 @@ _PART = re.compile(r"\.\d+\.mcap$")  # part of the recording, one for each sessi
 _LAST_BYTES = 65_536
 
 
-@click.group(cls=common.CommandGroup, epilog=common.example("ccatp runs list", "ccatp runs show runs/tonight"))
+@click.group(
+    cls=common.CommandGroup,
+    epilog=common.example("ccatp runs list", "ccatp runs show runs/tonight", "ccatp runs rm --older-than 30"),
+)
 def runs() -> None:
-    """List the runs in a folder, and show one."""
+    """List the runs in a folder, show one, and remove old ones."""
 
 
 @runs.command("list", epilog=common.example("ccatp runs list", "ccatp runs list /var/lib/ccatp/runs --json"))
@@ -65,6 +69,65 @@ def show(run_dir: Path, json_output: bool) -> None:
     ]
     lines = [f"{name:<15} {value}" for name, value in facts.items() if value != ""]
     common.print_result({**facts, "files": files}, [*lines, "", *sizes], json_output)
+
+
+@runs.command(
+    "rm",
+    epilog=common.example(
+        "ccatp runs rm runs/20261126T033120Z-fyst-m1-s1", "ccatp runs rm --older-than 30 --keep 10 --yes"
+    ),
+)
+@click.argument("run_dirs", metavar="[RUN_DIR]...", nargs=-1, type=common.PATH)
+@click.option(
+    "--older-than",
+    "older_than_days",
+    type=click.FloatRange(min=0.0),
+    metavar="DAYS",
+    help="The runs in --folder that nothing has changed for so many days.",
+)
+@click.option(
+    "--keep", type=click.IntRange(min=0), metavar="N", help="The runs in --folder, except the N newest of all."
+)
+@click.option(
+    "--folder", type=common.PATH, default="runs", show_default=True, help="Where --older-than and --keep look."
+)
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--force", is_flag=True, help="Remove a named RUN_DIR also if it could be resumed.")
+@common.JSON_OPTION
+def remove_runs(
+    run_dirs: tuple[Path, ...], older_than_days: float | None, keep: int | None, folder: Path, yes: bool, force: bool,
+    json_output: bool,
+) -> None:  # fmt: skip
+    """Remove run directories: those named, or old ones.
+
+    A run that goes on is never removed, and one that could be resumed only if it is named with --force. Links, and
+    folders that are no run, are refused.
+    """
+    from ccatp.daemon.supervision import run_removal as removal
+
+    is_by_age = older_than_days is not None or keep is not None
+    if bool(run_dirs) is is_by_age:
+        raise click.UsageError("name run directories, or choose them by --older-than or --keep")
+    if force and not run_dirs:
+        raise click.UsageError("--force goes with named run directories")
+    if run_dirs:
+        refused = [f"{run_dir}: {why}" for run_dir in run_dirs if (why := removal.refusal(run_dir, force=force))]
+        if refused:
+            raise ConfigError(*refused, shows_all=True)  # nothing is removed
+    elif not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder; name one that holds run directories with --folder")
+    chosen = run_dirs or removal.chosen_by_age(folder, older_than_days=older_than_days, keep=keep)
+    sizes = {run_dir: removal.size_bytes(run_dir) for run_dir in chosen}
+    total_mb = sum(sizes.values()) / 1e6
+    if chosen and not yes:
+        common.print_lines(f"{size / 1e6:10.1f} MB  {run_dir}" for run_dir, size in sizes.items())
+        if not sys.stdin.isatty():
+            raise ConfigError("nothing is removed: there is no terminal to ask; give --yes")
+        click.confirm(f"Remove {len(chosen)} runs, {total_mb:.1f} MB?", abort=True)
+    for run_dir in chosen:
+        removal.remove(run_dir, force=force)
+    lines = [f"removed {len(chosen)} runs, {total_mb:.1f} MB" if chosen else "no run is removed"]
+    common.print_result({"removed": [str(run_dir) for run_dir in chosen], "mb": round(total_mb, 1)}, lines, json_output)
 
 
 def _facts(run_dir: Path) -> dict[str, Any]:

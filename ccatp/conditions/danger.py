@@ -164,7 +164,7 @@ EDGE_SENSOR_STAYS_DARK = slow("edge_sensor_stays_dark", Owner.DANGER, 280, Group
     "an edge sensor went off though nothing moved",
     "It stays off for longer than a pause may last: the edge rule decides, at half the speed.",
     "Clean or replace it. Stray light: cover the place.")
-IMU_LEFT_OUT = slow("imu_left_out", Owner.DANGER, 290, Group.SENSORS, "{what}: left out",
+IMU_LEFT_OUT = slow("imu_left_out", Owner.DANGER, 290, Group.SENSORS, "{what}: not used",
     "Readings of the inertial unit are impossible (stuck, at their limit, a jump), or arrive late. It is not used: "
     "wheels alone, at half the speed.", "The accuracy is lower. Replace it if this does not end.")
 ACCELEROMETER_DIFFERENCES = inform("accelerometer_differences", Owner.DANGER, 300, Group.SENSORS,
@@ -186,7 +186,8 @@ BATTERY_REPORTED = go_home("battery_reported", Owner.DANGER, 330, Group.FANS, "t
 
 # -- seams ------------------------------------------------------------------------------------------------------------
 
-EDGE_SENSOR_BLIND = hold("edge_sensor_blind", Owner.DANGER, 340, Group.SENSORS, "an edge sensor sees no seams: blind",
+EDGE_SENSOR_BLIND = hold("edge_sensor_blind", Owner.DANGER, 340, Group.SENSORS,
+    "an edge sensor detects no seams: blind",
     "It would not detect the rim either.", "Clean or replace it before `ccatp resume`.", retries=0, trusts_wheels=True,
     action=Action.LOCATE, then="clean or replace the edge sensor")
 SEAM_MISSED = slow("seam_missed", Owner.DANGER, 350, Group.SENSORS, "an edge sensor did not see a seam",

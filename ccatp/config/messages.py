@@ -135,9 +135,15 @@ def unit_hint(key: Key, value: float, limit: float = math.inf) -> str:
 
 
 def faults_of(errors: Iterable[Mapping[str, Any]], root: type[BaseModel] = Config) -> Iterator[ConfigProblem]:
-    """The findings of ``ValidationError.errors()`` as problems, misspelt keys first: they also cause missing ones."""
+    """The findings of ``ValidationError.errors()`` as problems, each once, unknown keys first.
+
+    A key that is missing because it is misspelt is one problem, that of the unknown key.
+    """
     ordered = sorted(errors, key=lambda error: error["type"] != "extra_forbidden")
-    return (ConfigProblem(tuple(error["loc"]), _what(error, root)) for error in ordered)
+    meant = {_meant(tuple(error["loc"]), root) for error in ordered if error["type"] == "extra_forbidden"}
+    for error in ordered:
+        if error["type"] != "missing" or tuple(error["loc"]) not in meant:
+            yield ConfigProblem(tuple(error["loc"]), _what(error, root))
 
 
 def _what(error: Mapping[str, Any], root: type[BaseModel]) -> str:
@@ -159,17 +165,28 @@ def _what(error: Mapping[str, Any], root: type[BaseModel]) -> str:
     return f"= {format_value(value)} {must}{hint}"
 
 
-def _unknown(key: Key, root: type[BaseModel]) -> str:
-    """A key that no model has: the nearest one beside it, else one of the same name in another section."""
-    *section, name = key
-    paths = list(_paths(root))
-    beside = [path for path in paths if len(path) == len(key) and all(map(_fits, path, section))]
-    siblings = {path[-1]: (*section, path[-1]) for path in beside}
-    everywhere = {path[-1]: path for path in paths}
+def _meant(key: Key, root: type[BaseModel]) -> Key | None:
+    """The key that an unknown one means: the nearest one beside it, else one of the same name in another section."""
+    siblings = _siblings(key, root)
+    everywhere = {path[-1]: path for path in _paths(root)}
     for known in siblings, everywhere:
-        if near := nearest(str(name), known):
-            return f"is unknown; did you mean {format_key(known[near])}?"
-    return f"is unknown; known here: {', '.join(siblings)}"
+        if near := nearest(str(key[-1]), known):
+            return known[near]
+    return None
+
+
+def _siblings(key: Key, root: type[BaseModel]) -> dict[str, Key]:
+    """The known keys beside a key, by their last part."""
+    *section, _ = key
+    beside = [path for path in _paths(root) if len(path) == len(key) and all(map(_fits, path, section))]
+    return {path[-1]: (*section, path[-1]) for path in beside}
+
+
+def _unknown(key: Key, root: type[BaseModel]) -> str:
+    meant = _meant(key, root)
+    if meant is not None:
+        return f"is unknown; did you mean {format_key(meant)}?"
+    return f"is unknown; known here: {', '.join(_siblings(key, root))}"
 
 
 def _fits(part: str, given: str | int) -> bool:

@@ -220,7 +220,7 @@ class Recording:
     @property
     def notes(self) -> list[str]:
         """What a reader has to know: restarts of the robot, steps of its clock, sessions that are left out."""
-        left_out = [f"{path}: left out, it holds no frame of the robot" for path in self.sessions_without_frames]
+        left_out = [f"{path}: not used, it holds no frame of the robot" for path in self.sessions_without_frames]
         return [*left_out, *(f"{self.path}: {note}" for note in self.timeline.notes)]
 
     def has_frames(self) -> bool:

@@ -348,13 +348,21 @@ class SummaryBuilder:
         return np.concatenate(found) if found else np.empty((0, _CLEARANCE + 1))
 
 
+_SHOWN_AS = {"left_out": "not measured"}  # a key whose name is no word for people
+
+
 def format_table(summary: Mapping[str, Any], ended: str = "") -> str:
     """The summary as a short table for a terminal: how it ended, then one line a section, a dash for null."""
     summary = {name: value for name, value in summary.items() if name != "ended"}
-    single = [f"{key} {_text(value)}" for key, value in summary.items() if not isinstance(value, Mapping)]
+    single = [
+        f"{_SHOWN_AS.get(key, key)} {_text(value)}" for key, value in summary.items() if not isinstance(value, Mapping)
+    ]
     sections = [(name, section) for name, section in summary.items() if isinstance(section, Mapping)]
     lines = [("ended", [ended])] if ended else []
-    lines += [("run", single), *((n, [f"{key} {_text(value)}" for key, value in s.items()]) for n, s in sections)]
+    lines += [
+        ("run", single),
+        *((n, [f"{_SHOWN_AS.get(key, key)} {_text(value)}" for key, value in s.items()]) for n, s in sections),
+    ]
     width = max(len(name) for name, _ in lines)
     return "\n".join(f"{name.replace('_', ' '):<{width}}  {'  '.join(values)}" for name, values in lines)
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 from pydantic import Field, ValidationError, create_model
 
 from ccatp.config.files import read_toml
-from ccatp.config.messages import choice_hint, faults_of, find_line, format_key, format_value, parse_toml
+from ccatp.config.messages import choice_hint, faults_of, find_line, format_key, format_value, nearest, parse_toml
 from ccatp.config.models import Model, NonNegative, Positive
 from ccatp.errors import ConfigError
 
@@ -336,6 +336,9 @@ def _parse_link_fault(row: Mapping[str, Any]) -> tuple[Any, _Problems]:
 def _choose(row: Mapping[str, Any], key: str, choices: Mapping[str, Any], of: str = "") -> tuple[Any, _Problems]:
     value = row.get(key)
     if value is None:
+        misspelt = nearest(key, row)
+        if misspelt is not None:
+            return None, [(misspelt, f"is unknown; did you mean {key}?")]
         return None, [(key, f"is missing; {choice_hint('', choices)}")]
     if not isinstance(value, str):
         return None, [(key, f"= {format_value(value)} must be text in quotes")]

@@ -24,15 +24,15 @@ class Mode(StrEnum):
 
 
 IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE = Mode
-MOVES = "stands for a moment before the move or until the danger loop permits it, then goes on by itself"
+MOVES = "stands for a moment before the move or until the danger loop permits it, then continues by itself"
 # What a robot waits for that stands in a mode while nothing is wrong, and what happens then.
 WAITS_FOR = MappingProxyType(
     {
         IDLE: "waits for the robot, its laser system and the permit of the danger loop, then starts by itself",
         **dict.fromkeys((TURNING, DRIVING, BACKING_OFF, RETURNING), MOVES),
         SETTLING: "waits until the wheels are at rest, then measures",
-        MEASURING: "waits for the lengths of the laser system, then goes on to the next point",
-        HELD: "goes on by itself when the cause of the hold is gone, else with 'ccatp resume'",
+        MEASURING: "waits for the lengths of the laser system, then continues with the next point",
+        HELD: "continues by itself when the cause of the hold is gone, else with 'ccatp resume'",
         DONE: "the run ends by itself",
     }
 )

@@ -222,7 +222,7 @@ async def test_a_list_that_is_empty_or_unreadable_admits_no_client(site: Site, r
 
 
 @pytest.mark.fault("O6")
-async def test_who_is_taken_off_the_list_loses_their_rights_while_connected(site: Site) -> None:
+async def test_a_client_removed_from_the_list_loses_its_rights_while_connected(site: Site) -> None:
     async with served(site) as context:
         with context.socket(zmq.DEALER) as peer:
             with_curve(site.client("observatory"))(peer)

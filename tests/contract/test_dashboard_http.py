@@ -415,7 +415,7 @@ async def closed(reader: asyncio.StreamReader) -> bytes:
 ANSWERED = b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n"
 
 
-async def test_who_sends_no_whole_request_is_dropped(rig: Rig) -> None:
+async def test_a_client_that_sends_no_complete_request_is_disconnected(rig: Rig) -> None:
     # After a first request no keep-alive of the server's own counts.
     for sent in ((b"",), (b"GET / HTTP/1.1\r\nhost: local",), (ANSWERED, b"GET /healthz HTTP")):
         reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
@@ -428,7 +428,7 @@ async def test_who_sends_no_whole_request_is_dropped(rig: Rig) -> None:
         writer.close()
 
 
-async def test_who_takes_nothing_is_dropped(rig: Rig, runtime_dir: Path) -> None:
+async def test_a_client_that_reads_nothing_is_disconnected(rig: Rig, runtime_dir: Path) -> None:
     await rig.until("/healthz", lambda reply: reply.code == 200)
     lazy = socket.socket()
     lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

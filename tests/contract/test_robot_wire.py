@@ -251,7 +251,7 @@ def test_the_first_and_the_last_time_are_in_range(t_s: float) -> None:
     assert decoded.imu[0].t_s == decoded.enc[0].t_s == decoded.edge[0].t_s == t_s
 
 
-def test_unknown_keys_are_ignored_and_unknown_types_told_apart() -> None:
+def test_unknown_keys_are_ignored_and_unknown_types_are_recognized() -> None:
     assert decode_from_client(b'{"type":"drive","note":{"a":[1,":"]},"seq":7,"ack":6,"wr":3.5,"wl":-0.25}') == Drive(
         seq=7, ack=6, wr=3.5, wl=-0.25
     )

@@ -504,7 +504,7 @@ def test_fans_that_get_weaker_send_the_robot_home_in_time(measured: Measured) ->
     measured("F2", 0.91 * OVERHANG.robot.fan_duty[0] / OVERHANG.sim.robot.fan_floor)
 
 
-def test_where_nothing_hangs_a_weak_fan_is_only_told() -> None:
+def test_a_weak_fan_is_only_reported_where_the_mirror_does_not_overhang() -> None:
     run = with_fans(HARD, 'faults raise names=["fan_left"]')
     assert run.seen[-1].verdict.severity is Severity.INFORM
     assert run.seen[-1].verdict.forward

@@ -151,7 +151,7 @@ def test_the_edge_sweep_continues_where_it_was_stopped(
     assert "seam: 2 of 2 blocks, 5 drives" in said
 
 
-def test_the_edge_sweep_tells_who_fell(
+def test_the_edge_sweep_reports_which_robot_fell(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     few_drives(monkeypatch, falls_at=3)

@@ -50,7 +50,7 @@ IN_REPORT = (
 
 
 @pytest.mark.slow
-def test_the_morning_shows_what_happened_why_who_knew_and_what_was_measured(tmp_path: Path) -> None:
+def test_the_records_show_what_happened_why_who_acknowledged_it_and_what_was_measured(tmp_path: Path) -> None:
     night = Night(tmp_path)
     try:
         spend(night)

@@ -8,10 +8,12 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import click
+import msgspec
 import pytest
 import yaml
 from markdown_it import MarkdownIt
@@ -22,8 +24,16 @@ from ccatp.cli import cli
 from ccatp.conditions import danger_text
 from ccatp.config import package
 from ccatp.config.load import load_config
+from ccatp.core import Verdict
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
-from tests.unit.report.dashboard.test_view import ALL, metrics_of
+from ccatp.links.topics import Alarm, DisplayState, FixMessage, Heartbeat, Message, MissionStatus
+from ccatp.mirror.mirror import build_mirror
+from ccatp.report.dashboard.survey_view import SurveyView, ground
+from ccatp.report.dashboard.view import LOOPS
+from ccatp.survey.engagement import Engagement
+from ccatp.survey.turn import turn_of
+from tests.unit.report.dashboard.test_view import metrics_of
+from tests.unit.report.dashboard.test_views import LINE
 
 
 @pytest.mark.parametrize("is_installed", [True, False])
@@ -157,9 +167,32 @@ def test_links_of_the_readme_lead_to_files_that_are_there_and_are_absolute_on_a_
     assert [token.content for token in tokens if token.type == "text" and re.search(r"\[.*\]", token.content)] == []
 
 
-def exported() -> set[str]:
-    """Names of all metrics, with a process that is there."""
-    return set(metrics_of(ALL | {"pids": {"main": os.getpid()}}, 1))
+@cache
+def exported() -> frozenset[str]:
+    """Names of all metrics that the messages of a run lead to, with a process that is there."""
+    cfg = load_config()
+    mirror = build_mirror(cfg.mirror)
+    view = SurveyView(mirror, cfg, is_sim=True)
+    view.is_watched = True
+    state = Engagement()
+    alarm = Alarm(name="lifted", severity="hold", cause="lifted", advice="look", since="", since_s=0.0)
+    messages: tuple[Message | Verdict, ...] = (
+        *(Heartbeat(seq=0, t_s=0.0, process=name, pid=1, phase="joined", frame_age_s=0.0) for name in LOOPS),
+        MissionStatus(seq=0, t_s=0.0, state="driving", alarms=[alarm], turn=turn_of(state, None, ())),
+        DisplayState(
+            seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, covariance_m2=(1e-6, 0.0, 1e-6), heading_sigma_rad=0.1,
+            nis=2.0, size=2, line=msgspec.Raw(LINE),
+        ),
+        Verdict.normal(0, 0.0),
+        FixMessage(
+            seq=0, t_s=0.0, point=None, is_fused=True, position_m=(0.0, 0.0, 0.0), covariance_m2=[0.0] * 9, dop=3.0,
+            residual_rms_m=1e-6, channels=[1], jump_mm=0.1,
+        ),
+    )  # fmt: skip
+    for message in messages:
+        view.receive(message, 0.0)
+    states = ground(mirror, cfg, is_sim=True)
+    return frozenset(metrics_of(view.status_data(0.1) | {"pids": {"main": os.getpid()}}, 1, **states))
 
 
 def queries() -> dict[str, str]:

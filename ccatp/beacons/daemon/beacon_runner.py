@@ -128,8 +128,9 @@ class BeaconRunner(MissionRunner):
         self.telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode)
         if HELD in (mode, before) or mode is RETURNING:
             text = f"{mode}: {text_of(state.cause)}" if state.cause else f"{mode}"
-            self.telemetry.notify_operator("warning", text)
-            self._store.record_event(self._clock.t_s, "warning", text)
+            level = "warning" if mode in (HELD, RETURNING) else "info"
+            self.telemetry.notify_operator(level, text)
+            self._store.record_event(self._clock.t_s, level, text)
         if mode is DONE:
             self._publish_map(self.telemetry.seq, self.telemetry.t_s)
             self._host.finish(EXIT_STATUS[state.outcome])

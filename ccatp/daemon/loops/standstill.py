@@ -50,7 +50,7 @@ class StandstillWatch:
         stands = self._heartbeat.phase != "done" and self._runner.is_at_rest
         lasts_s = self._report.lasts_s(now_s, stands=stands)
         if lasts_s is not None:
-            text = f"the robot stands for {lasts_s:.0f} s: {self._reason(is_withheld)}"
+            text = f"the robot has been stationary for {lasts_s:.0f} s: {self._reason(is_withheld)}"
             self._runner.telemetry.notify_operator("warning", text)
 
     def _reason(self, is_withheld: bool) -> str:

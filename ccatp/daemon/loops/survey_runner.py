@@ -304,7 +304,8 @@ class SurveyRunner(MissionRunner):
             self._fault_timer.over()
         telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode, cause=text_of(state.cause))
         if mode in (Mode.HELD, Mode.BACKING_OFF) or before is Mode.HELD:
-            telemetry.notify_operator("warning", state_text(mode, text_of(state.cause)))
+            is_resumed = mode not in (Mode.HELD, Mode.BACKING_OFF, Mode.RETURNING)
+            telemetry.notify_operator("info" if is_resumed else "warning", state_text(mode, text_of(state.cause)))
         if mode is Mode.RETURNING and before is not Mode.BACKING_OFF:
             telemetry.notify_operator("warning", f"returning to base: {text_of(state.cause)}")
         if mode is Mode.DONE:

@@ -37,6 +37,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import ccatp
+from ccatp.conditions import Actor
 from ccatp.config.models import DashboardConfig
 from ccatp.links.channels import BadRequest, OperatorCommand, format_request, parse_object, parse_reply
 from ccatp.links.liveness import LogRateLimit
@@ -66,6 +67,8 @@ GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
      lambda p: p.nis / p.size if p.size else None),
     ("laser_residual_meters", "Root mean square of the last fix's residuals.", "laser",
      lambda fix: 1e-6 * fix["residual_um"]),
+    ("laser_dop", "Dilution of precision of the last fix.", "laser", lambda fix: fix["dop"]),
+    ("last_fix_age_seconds", "Since the last fix of the laser system.", "laser", lambda fix: fix["age_s"]),
 )  # fmt: skip
 COUNTERS = {"late_frames", "process_restarts", "process_cpu_seconds"}
 POINT_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
@@ -134,6 +137,8 @@ class StateCollector(Collector):
         if mission is not None:
             states = [((known,), known == mission["state"]) for known in self._ground["states"]]
             yield "mission_state", "1 for the state of the mission.", ("state",), states
+            actors = [((str(actor),), actor == mission["turn"].get("actor")) for actor in Actor]
+            yield "next_actor", "1 for who acts next.", ("actor",), actors
             counts = [((name,), mission[key]) for name, key in POINT_COUNTS.items()]
             yield "points", "Measurement points, or waypoints.", ("state",), counts
         if robot is not None:

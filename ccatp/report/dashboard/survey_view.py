@@ -181,5 +181,7 @@ class SurveyView(RunStateView):
         fix, laser = self._laser, None
         if fix is not None:
             residual_um = round(1e6 * fix.residual_rms_m, 2)
+            age_s = round(max(now_s - (self.links.fix_s or now_s), 0.0), 2)
             laser = {"dop": fix.dop, "residual_um": residual_um, "channels": fix.channels, "is_used": fix.is_fused}
+            laser |= {"age_s": age_s}
         return {**super()._levels(now_s), "laser": laser}

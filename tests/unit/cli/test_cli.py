@@ -71,7 +71,8 @@ def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() ->
     assert {" ".join(path) for path in commands(cli) if path} - {"plot", "conformance", "dashboard"} == {
         "run", "status", "alarms", "alarms ack", "alarms history", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config diff",
-        "config init", "config schema", "config show", "runs", "runs list", "runs show", "study", "replay", "bench",
+        "config init", "config schema", "config show", "runs", "runs list", "runs rm", "runs show",
+        "study", "replay", "bench",
         "keys", "keys generate", "keys show-public", "clear", "align", "plan", "report", "compare",
         "recording", "recording export", "recording info", "recording repair",
         "stream", "calibrate", "check", "completion", "onboard", "onboard tune",

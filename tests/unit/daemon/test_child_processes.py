@@ -155,7 +155,7 @@ def test_niceness_and_the_time_of_the_last_process(
         (ProcessSpec("main", "unending_child"), ["process main did not stop within 0 s and was killed"]),
     ],
 )
-def test_who_does_not_stop_is_killed(
+def test_a_process_that_does_not_stop_is_killed(
     children: ProcessManager, said: list[str], monkeypatch: pytest.MonkeyPatch, spec: ProcessSpec, lines: list[str]
 ) -> None:
     monkeypatch.setattr("ccatp.daemon.supervision.child_processes.STOP_TIMEOUT_S", 0.0)

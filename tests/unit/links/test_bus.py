@@ -92,7 +92,7 @@ def test_a_topic_is_not_a_prefix_and_bad_messages_are_counted_and_dropped(bus: B
     assert subscriber.bad_messages == 1
 
 
-def test_nobody_waits_for_an_onlooker_who_gets_it_all_the_same(bus: Bus) -> None:
+def test_nobody_waits_for_an_observer_and_it_receives_every_message(bus: Bus) -> None:
     publisher = bus.publisher()
     onlooker = bus.subscriber("heartbeat.main", is_uncounted=True)
     other = bus.subscriber("log")

@@ -113,7 +113,7 @@ def test_a_session_without_a_frame_is_left_out_and_named(tmp_path: Path, config_
     record(tmp_path, [("rest", Rest(seq=0, t_s=0.0))], config=config_text)
     (recording,) = open_recordings(tmp_path)
     assert (recording.path.name, len(list(recording.messages()))) == ("telemetry.1.mcap", 2)
-    assert recording.notes == [f"{tmp_path / 'telemetry.mcap'}: left out, it holds no frame of the robot"]
+    assert recording.notes == [f"{tmp_path / 'telemetry.mcap'}: not used, it holds no frame of the robot"]
     (alone,) = open_recordings(tmp_path / "telemetry.mcap")
     assert not alone.has_frames()
 

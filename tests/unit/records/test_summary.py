@@ -274,7 +274,7 @@ def test_the_table_has_every_figure_and_counts_points_left_out_by_reason(builder
     )
     builder.set_mission(1, 2, 3.0, {"operator": ["1-2-3", "1-2-4"], "no fix": ["1-2-5"]})
     (line,) = (line for line in format_table(builder.build()).splitlines() if line.startswith("points"))
-    assert line.endswith("left_out 2 (operator), 1 (no fix)")
+    assert line.endswith("not measured 2 (operator), 1 (no fix)")
 
 
 def test_points_whose_lengths_contradict_each_other_are_counted_where_there_are_any(builder: SummaryBuilder) -> None:

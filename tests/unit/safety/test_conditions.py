@@ -225,7 +225,7 @@ ROWS = [
     ),
     Row(rows.EDGE_SENSOR_FLASHES, always(off=(2,)), signal="rear_left", lasts=False),
     Row(rows.EDGE_SENSOR_STAYS_DARK, always(off=(2,)), signal="rear_left", lasts=False),
-    Row(rows.IMU_LEFT_OUT, always(wz_rad_s=9.0), cause="the gyroscope's rate is impossible: left out"),
+    Row(rows.IMU_LEFT_OUT, always(wz_rad_s=9.0), cause="the gyroscope's rate is impossible: not used"),
     Row(rows.SAMPLES_TOO_FEW, always(imu=5), signal="imu"),
     Row(rows.BATTERY_LOW, always(soc=0.01), signal="soc", clears_s=None),
     Row(rows.BATTERY_REPORTED, always(faults=("battery_low",)), signal="battery_low", clears_s=None),

@@ -26,7 +26,7 @@ ROLLS_M_S = 0.0054  # just above what a standing wheel may show
         pytest.param(0.0, 1.11, 1.0, False, None, id="main is silent and the robot may move"),
     ],
 )
-def test_a_wheel_that_rolls_although_it_was_told_to_stand_is_found(
+def test_a_wheel_that_rolls_although_it_is_commanded_to_stand_is_found(
     late_until_s: float,
     rolls_from_s: float,
     silent_from_s: float,

@@ -100,6 +100,19 @@ def test_a_mistake_is_one_line_with_its_place(text: str, message: str) -> None:
     assert all("\n" not in problem for problem in caught.value.problems)
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[[fault]]\nsignal = "soc"\ntype = "off"\nat = 1.0', "plan:4: fault[0].at is unknown; did you mean at_s?"),
+        ('[[fault]]\nsignl = "soc"\ntype = "off"', "plan:2: fault[0].signl is unknown; did you mean signal?"),
+    ],
+)
+def test_a_misspelt_key_is_one_problem_and_not_also_a_missing_one(text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_plan(text, "plan")
+    assert list(caught.value.problems) == [message]
+
+
 def test_every_mistake_is_reported() -> None:
     with pytest.raises(ConfigError, match=r"\(and 2 more") as caught:
         parse_plan(FAULT + 'type = "off"\na = 1\nb = 2\n' + LINK + 'type = "x"', "plan")

@@ -92,7 +92,7 @@ export class Plots {
     for (const name of names) this.observer.observe(this.places[name]);
   }
 
-  // An empty plot takes no room, and those for engineers are shown to whom wants them.
+  // An empty plot takes no room, and those for engineers are shown when they are wanted.
   showFigures() {
     const figures = this.names.map((name) => [name, this.places[name].closest("figure")]);
     const isFor = (figure) => this.engineerBox.checked || !("engineer" in figure.dataset);

@@ -239,7 +239,7 @@ def test_ranges_in_space_mapped_in_the_plane(tell: Any, tmp_path: Path) -> None:
     assert np.sqrt(np.diag(covariance_m2).max()) > 0.1  # metres off, and it shows
 
 
-def test_no_scale_where_none_can_be_told(tell: Any) -> None:
+def test_no_scale_is_given_where_none_can_be_determined(tell: Any) -> None:
     data = tell(FLAT, "--scale", scale=1.1)
     assert (data["scale"], data["expected_rms_m"], data["crlb_m"]) == (None, None, None)
     assert data["warnings"][-1].startswith("no scale can be determined from these ranges")

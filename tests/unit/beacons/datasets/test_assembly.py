@@ -153,7 +153,7 @@ def test_a_placeholder_is_not_a_signal_strength(tmp_path: Path, dbm: str, what: 
     assert run.readings.rssi_dbm.min() > -80.0
 
 
-def test_an_empty_cell_is_a_beacon_that_was_not_heard(tmp_path: Path) -> None:
+def test_an_empty_cell_is_a_beacon_without_reception(tmp_path: Path) -> None:
     run, said = read(tmp_path, with_value("range", 3, "", lambda k: k == 10))
     assert run.readings.range_m.size == len(W.read_s) - 1
     assert "1 row not finite" in said

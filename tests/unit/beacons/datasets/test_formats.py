@@ -147,7 +147,7 @@ def test_csv_of_signal_strengths_lateral_ways_and_names(tmp_path: Path) -> None:
     assert np.isnan(run.truth.heading_rad).all()
 
 
-def test_rows_out_of_order_doubled_or_not_finite_are_mended_and_told(tmp_path: Path) -> None:
+def test_rows_out_of_order_doubled_or_not_finite_are_repaired_and_reported(tmp_path: Path) -> None:
     write_mrclam(tmp_path, W)
     seen = tmp_path / "Robot1_Measurement.dat"
     head, rows = seen.read_text(encoding="utf-8").splitlines()[:2], seen.read_text(encoding="utf-8").splitlines()[2:]

@@ -106,7 +106,7 @@ def test_a_turn_of_the_reflector_is_strongest_towards_the_radio() -> None:
     assert levels.min() == pytest.approx(levels.max() - 15.0, abs=1.0)
 
 
-def test_packets_are_lost_as_often_as_told_and_below_the_sensitivity() -> None:
+def test_packets_are_lost_at_the_configured_rate_and_below_the_sensitivity() -> None:
     one = radio(radio_config_of(sim__radio__loss_probability=0.3))
     lost = sum(one.scan(TruePose(0.0, 0.0, 0.0), (1.0, 0.0)).count(None) for _ in range(50))
     assert lost == pytest.approx(0.3 * 2000, abs=4 * (2000 * 0.21) ** 0.5)

@@ -220,6 +220,7 @@ ALL: dict[str, Any] = NOTHING | {
     "mission": {
         "state": "driving", "total": 693, "done": 12, "skipped": 1, "elapsed_s": 61.5, "eta_s": 3000.0,
         "missed_deadlines": 2, "worst_lateness_ms": 21.0, "error_mm": 0.25,
+        "turn": {"actor": "operator"},
     },
     "verdict": {"code": 1, "severity": 2},
     "robot": {
@@ -230,7 +231,7 @@ ALL: dict[str, Any] = NOTHING | {
         seq=0, t_s=0.0, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(9e-6, 0.0, 16e-6), heading_sigma_rad=0.01,
         nis=2.0, size=2, line=NO_LINE,
     ),
-    "laser": {"dop": 1.0, "residual_um": 12.0, "channels": [1, 2, 3, 4], "is_used": True},
+    "laser": {"dop": 1.0, "residual_um": 12.0, "channels": [1, 2, 3, 4], "is_used": True, "age_s": 7.5},
 }  # fmt: skip
 
 
@@ -279,6 +280,9 @@ def test_all_metrics() -> None:
         "ccatp_permit_age_seconds": {(): 0.02},
         "ccatp_robot_faults": {(): 1.0},
         "ccatp_laser_residual_meters": {(): 12e-6},
+        "ccatp_laser_dop": {(): 1.0},
+        "ccatp_last_fix_age_seconds": {(): 7.5},
+        "ccatp_next_actor": {("robot",): 0.0, ("operator",): 1.0, ("observatory",): 0.0, ("nobody",): 0.0},
         "ccatp_dashboard_pages": {(): 3.0},
     }
 
