@@ -247,6 +247,10 @@ class EdgeSensors:
         self._body = plant.x_m, plant.y_m, plant.hx, plant.hy, plant.lx, plant.ly
         self._look()
 
+    def lift(self) -> None:
+        """There is no panel under any sensor from now on: the robot has left the surface, and its wheels stand."""
+        self._values = (0, 0, 0, 0)
+
     def is_on(self, x: float, y: float) -> bool:
         """Whether there is material at a point of the deck plane."""
         return self._inside_m(x, y) >= 0.0

@@ -115,6 +115,8 @@ class World:
     def _fall(self, why: str) -> None:
         self.is_fallen, self.fall = True, self.fall or why
         self.plant.stop_dead()
+        if self.sensors is not None:
+            self.sensors.lift()
 
     def truth_row(self, seq: int, t_s: float) -> TruthRow:
         """The truth at frame ``seq``."""

@@ -14,9 +14,11 @@ from ccatp.conditions import text_of
 from ccatp.conditions.danger import IMU_LEFT_OUT, TURN_TIMES_DIFFER
 from ccatp.control.gate import FanGate
 from ccatp.core import Severity
+from ccatp.sim.fault_plan import parse_plan
+from ccatp.studies.sil_run import SilRun
 from ccatp.survey.events import Mode, SurveyOutcome
 from tests.faults.linking import Measured
-from tests.support.scenario import one_panel
+from tests.support.scenario import config_of, one_panel
 from tests.support.sim_survey import Seen, Watched, watched
 
 # Of the first seconds of a short survey in the hard world with seed 1: see ``test_the_times_are_what_they_are_called``.
@@ -502,6 +504,17 @@ def test_fans_that_get_weaker_send_the_robot_home_in_time(measured: Measured) ->
     assert run.seen[-1].state is Mode.RETURNING
     assert run.robot.fans.duty == (1.0, 1.0)
     measured("F2", 0.91 * OVERHANG.robot.fan_duty[0] / OVERHANG.sim.robot.fan_floor)
+
+
+def test_a_robot_that_falls_because_a_fan_lost_its_thrust_is_found_in_the_next_frame() -> None:
+    cfg = config_of("fyst-m2", run__panels=1, mission__calibration_length_m=0.0)
+    run = SilRun(cfg, parse_plan('[[fault]]\nsignal = "left_fan"\ntype = "weak"\nat_s = 12.0\nshare = 0.4', "plan"))
+    found = run.run()
+    state = run.mission.state
+    assert (run.robot.world.fall, found.summary["danger"]["falls"]) == ("thrust", 1)
+    assert (state.is_faulted, state.cause.condition) == (True, "lifted")
+    limit_s = cfg.health.lifted_limit_s + cfg.sim.robot.fall_thrust_s
+    assert found.summary["mission_time_s"] - 12.0 == pytest.approx(limit_s, abs=0.05)  # five frames
 
 
 def test_a_weak_fan_is_only_reported_where_the_mirror_does_not_overhang() -> None:

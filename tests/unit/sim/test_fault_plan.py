@@ -291,8 +291,10 @@ def test_a_weak_fan_echoes_its_duty_and_lets_the_robot_fall_from_an_overhang(sid
     assert robot.fans.health == (1.0, 1.0)
     assert not robot.world.is_fallen  # too short to fall
     longer = boot(cfg, mirror_of("fyst-m2"), signal=f"{side}_fan", type="weak", share=0.25)
-    drive(longer, 0.0, 0.0, 1.0)
+    frames = drive(longer, 0.0, 0.0, 1.0)
     assert longer.world.is_fallen
+    # A robot that has fallen has no panel under its sensors.
+    assert [frames[k]["edge"][-1][1:] for k in (0, -1)] == [[1, 1, 1, 1], [0, 0, 0, 0]]
     assert record(longer).changed >= 20
 
 
