@@ -142,7 +142,7 @@ class Slam(NamedTuple):
 def slam(
     recording: str | PathLike[str] | RecordedRun,
     *,
-    filter_name: str = "ekf-slam",
+    filter_name: str = "fixed-lag",
     data_format: str | None = None,
     robot: int | None = None,
     settings: Mapping[str, object] | None = None,

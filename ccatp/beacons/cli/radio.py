@@ -31,9 +31,9 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 )  # fmt: skip
 @click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
 @click.option(
-    "--filter", "filter_name", type=click.Choice(FILTERS), default=FILTERS[0], show_default=True,
-    help="ekf-slam: at each instant from readings up to it; fixed-lag: that, and again some seconds later; "
-    "smoother: from all of them.",
+    "--filter", "filter_name", type=click.Choice(FILTERS), default="fixed-lag", show_default=True,
+    help="fixed-lag: at each instant from readings up to it, which are linearised again, and once more some seconds "
+    "later; ekf-slam: each reading is linearised once; smoother: from all of them.",
 )  # fmt: skip
 @common.CONFIG_OPTION
 @common.settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")

@@ -559,6 +559,7 @@ class FixedLagConfig(Model):
 
     lag_s: Positive
     poses: Annotated[int, Field(ge=1)]
+    window_s: Positive
     map_s: Positive
 
 

@@ -1,11 +1,11 @@
 """The least-squares problem of a run: odometry between the instants of readings, residuals, normal equations."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array, vstack
 
-from ccatp.beacons.config.models import OdometryNoiseConfig, RecordingConfig
+from ccatp.beacons.config.models import OdometryNoiseConfig, PriorsConfig, RecordingConfig
 from ccatp.beacons.estimation.measurement_models import bearing_row, level_row, range_row, range_variance
 from ccatp.beacons.estimation.motion import POSE, step_variances, turned_way
 from ccatp.beacons.estimation.recording import BoolArray, Readings, Steps, running_total
@@ -30,7 +30,7 @@ class Reckoning:
 
     ``times_s``: the instants, shape (n + 1,), rising, within the steps. ``rest``: limits of speed, m/s, and turn rate,
     rad/s, below which a step is at rest: the turn that is read is the bias of the gyroscope, and the heading is
-    constant. ``at_rest``: total time and turn of all such steps, s and rad.
+    constant. ``at_rest``: total time and turn of all such steps that begin within the instants, s and rad.
     """
 
     def __init__(
@@ -45,7 +45,8 @@ class Reckoning:
         self._lengths = np.diff(np.append(self._starts, fine_s.size - 1))
         lasts_s = np.diff(steps.times_s)
         rests = (np.abs(steps.distance_m) < rest[0] * lasts_s) & (np.abs(steps.turn_rad) < rest[1] * lasts_s)
-        self.at_rest = float(lasts_s[rests].sum()), float(steps.turn_rad[rests].sum())
+        within = rests & (steps.times_s[:-1] >= times_s[0]) & (steps.times_s[:-1] < times_s[-1])
+        self.at_rest = float(lasts_s[within].sum()), float(steps.turn_rad[within].sum())
 
         self._fine_s, self._steps_s = fine_s, steps.times_s
         guesses = (np.broadcast_to(guess, steps.distance_m.shape) for guess in (steps.guess_m2, steps.guess_rad2))
@@ -167,6 +168,79 @@ class BatchState:
         return BatchState(self.poses + poses, self.shared + shared[:split], beacons)
 
 
+QUARTER_TURN = np.array(((0.0, -1.0), (1.0, 0.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class MarginalPrior:
+    """What readings before a window tell of its first pose, of the shared unknowns and of the beacons, without priors.
+
+    A quadratic form z^T L z / 2 - g^T z of the deviation z from the values at which it was made. In z all places are
+    turned back with the heading, z_p = R(heading_0 - heading) p - p_0, so a rotation of the whole map changes the
+    heading's part alone, wherever it is linearised: the form never gains information about the rotation that no
+    reading gave (as the errors of the invariant EKF: Barrau and Bonnabel 2015).
+    """
+
+    pose: FloatArray  # shape (3,)
+    shared: FloatArray  # by ``SHARED``, shape (11,)
+    beacons: FloatArray  # shape (b, 4)
+    known: BoolArray  # beacons that it contains, shape (b,); the rows of others are zero
+    information: FloatArray  # L, of z: pose, shared, beacons, shape (14 + 4 b, 14 + 4 b)
+    side: FloatArray  # g, shape (14 + 4 b,)
+
+    @classmethod
+    def made(
+        cls, state: BatchState, last: int, known: BoolArray, information: FloatArray, side: FloatArray
+    ) -> "MarginalPrior":
+        """From information and right-hand side of the deviations of pose ``last``, shared unknowns and beacons."""
+        pose, shared, beacons = state.poses[last].copy(), state.shared.copy(), state.beacons.copy()
+        nothing = cls(pose, shared, beacons, known, information, side)
+        back = np.linalg.inv(nothing._deviation(pose, shared, beacons)[1])
+        return cls(pose, shared, beacons, known, back.T @ information @ back, back.T @ side)
+
+    def cost(self, state: BatchState) -> float:
+        """The form at a state whose first pose is the prior's."""
+        z = self._deviation(state.poses[0], state.shared, state.beacons)[0]
+        return float(z @ (0.5 * (self.information @ z) - self.side))
+
+    def normal_equations(self, state: BatchState) -> tuple[FloatArray, FloatArray]:
+        """J^T L J and J^T (g - L z)."""
+        z, J = self._deviation(state.poses[0], state.shared, state.beacons)
+        return J.T @ self.information @ J, J.T @ (self.side - self.information @ z)
+
+    def _deviation(self, pose: FloatArray, shared: FloatArray, beacons: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """z, and its derivatives by pose, shared unknowns and beacons."""
+        turned = float(pose[2] - self.pose[2])
+        c, s = np.cos(turned), np.sin(turned)
+        back = np.array(((c, s), (-s, c)))
+        size = POSE + shared.size + beacons.size
+        z, J = np.empty(size), np.eye(size)
+        z[2], z[POSE : POSE + shared.size] = turned, shared - self.shared
+        z[POSE + shared.size :] = (beacons - self.beacons).ravel()
+        starts = POSE + shared.size + BEACON * np.arange(len(beacons))
+        for start, place, origin in (
+            (0, pose[:2], self.pose[:2]), *zip(starts.tolist(), beacons[:, :2], self.beacons[:, :2], strict=True),
+        ):  # fmt: skip
+            rows = slice(start, start + 2)
+            z[rows], J[rows, rows] = back @ place - origin, back
+            J[rows, 2] = -QUARTER_TURN @ (back @ place)
+        return z, J
+
+
+class BeaconNoise(NamedTuple):
+    """Noise of ranges by beacon, as estimated from residuals."""
+
+    variance: FloatArray  # factor on the configured variance, shape (b,)
+    repeats: FloatArray  # number of readings that count as one, because errors last, shape (b,)
+    share: FloatArray  # of the variance that lasts, shape (b,)
+    lasts_s: FloatArray  # its correlation time, s, shape (b,)
+
+    @classmethod
+    def configured(cls, count: int) -> "BeaconNoise":
+        """White noise of the configured variance."""
+        return cls(np.ones(count), np.ones(count), np.zeros(count), np.ones(count))
+
+
 @dataclass(slots=True)
 class Residuals:
     """Residuals at a state, and their derivatives.
@@ -192,17 +266,19 @@ class BatchProblem:
     """Odometry and readings of a run as a least-squares problem.
 
     ``times_s``: instants of the poses, beginning with the first odometry time, shape (n,). ``used``: mask of the
-    beacons that are estimated, shape (b,); readings of others are ignored.
+    beacons that are estimated, shape (b,); readings of others are ignored. ``marginal``: replaces the prior of the
+    first pose. ``noise``: of the ranges.
     """
 
     def __init__(
         self, steps: Steps, readings: Readings, times_s: FloatArray, first_pose: tuple[float, float, float],
         settings: RecordingConfig, used: BoolArray, rest: tuple[float, float] = (0.0, 0.0),
+        marginal: MarginalPrior | None = None, noise: BeaconNoise | None = None,
     ) -> None:  # fmt: skip
         priors = settings.priors
         rest = rest if priors.turn_bias_rad_s > 0.0 else (0.0, 0.0)
         self.reckoning = Reckoning(steps, times_s, delayed=priors.odometry_delay_s > 0.0, rest=rest)
-        self.readings = readings
+        self.times_s, self.readings = times_s, readings
         self.at: IntArray = np.searchsorted(times_s, readings.times_s)
         self.first_pose = np.array(first_pose)
         self.radio, self.odometry, self.priors = settings.radio, settings.odometry, priors
@@ -212,16 +288,14 @@ class BatchProblem:
         self.sizes: FloatArray = self.there.sum(axis=1).astype(np.float64)
         self._read = np.where(self.there, read, 0.0)
         self.repeats = repeats(readings, settings.radio.correlation_s)
-        # Prior standard deviations of the shared unknowns and the beacons, shape (11 + 4 b,): 0 fixes an unknown,
-        # infinity is no prior.
-        beacons = np.zeros((len(used), BEACON))
-        beacons[used] = (np.inf, np.inf, self.priors.beacon_offset_m, self.priors.beacon_reference_db)
-        sigmas = np.concatenate([[getattr(self.priors, name) for name in SHARED], beacons.ravel()])
-        self.free = sigmas > 0.0
-        self.prior_information = np.where(self.free, 1.0 / np.where(self.free, sigmas, 1.0) ** 2, 0.0)
-        self.prior_information[np.isinf(sigmas)] = 0.0
+        # Readings whose errors last are counted less, but their outliers are recognized by their own noise.
+        self.power = np.ones(len(readings.times_s)) if noise is None else 1.0 / noise.repeats[readings.beacon]
+        self._range_factor = 1.0 if noise is None else noise.variance[readings.beacon]
+        self.free, self.prior_information = of_priors(priors, used)
+        self.marginal = marginal
         rest_s, rest_rad = self.reckoning.at_rest
-        self._prior_mean = np.zeros(sigmas.size)
+        self.assumed_information = self.prior_information.copy()  # without what is measured at rest
+        self._prior_mean = np.zeros(self.free.size)
         if rest_s > 0.0:  # a measurement of the bias with the angle random walk of the gyroscope
             information = rest_s / max(self.odometry.turn_per_sqrt_s, TINY_RAD) ** 2
             self.prior_information[BIAS] += information
@@ -236,39 +310,74 @@ class BatchProblem:
         return self._last[1]
 
     def prior_cost(self, state: BatchState) -> float:
-        """Half the sum of squares of the priors."""
+        """Minus the logarithm of the priors, up to a constant."""
         shared = np.concatenate([state.shared, state.beacons.ravel()]) - self._prior_mean
-        first = state.poses[0] - self.first_pose
-        return float(0.5 * (shared**2 @ self.prior_information + first**2 @ self.first_information))
+        own = 0.5 * float(shared**2 @ self.prior_information)
+        if self.marginal is not None:
+            return own + self.marginal.cost(state)
+        return own + 0.5 * float((state.poses[0] - self.first_pose) ** 2 @ self.first_information)
 
     def normal_equations(self, state: BatchState, weights: FloatArray) -> ArrowSystem:
         """Normal equations of Gauss-Newton for the free unknowns; ``weights`` of the readings, shape (m,)."""
-        r, n = self.residuals(state), len(state.poses)
-        split, poses, k = POSE * n, POSE * np.arange(n)[:, None], len(CALIBRATION)
-        # Rows of odometry and of readings, each divided by its standard deviation.
-        root = np.linalg.cholesky(r.odometry_information).transpose(0, 2, 1)
-        chain = np.concatenate([poses[:-1] + np.arange(2 * POSE), np.tile(split + np.arange(k), (n - 1, 1))], axis=1)
-        scale = np.sqrt(r.information * weights[:, None])[:, :, None]
-        places = split + len(SHARED) + BEACON * self.readings.beacon[:, None] + np.arange(BEACON)
-        own = np.tile(split + np.arange(k, len(SHARED)), (len(places), 1))
-        seen = np.concatenate([poses[self.at] + np.arange(POSE), own, places], axis=1)
-        width = split + self.free.size
-        J = vstack([_rows(root @ r.by_steps, chain, width), _rows(scale * r.by_unknowns, seen, width)], "csr")
-        e = np.concatenate([(root @ r.odometry[:, :, None]).ravel(), (scale[:, :, 0] * r.readings).ravel()])
-        first = state.poses[0] - self.first_pose
-        shared = np.concatenate([state.shared, state.beacons.ravel()]) - self._prior_mean
-        free = split + np.flatnonzero(self.free)
-        H, side = (J.T @ J).tocsc(), -(J.T @ e)
-        band = np.zeros((2 * POSE, split))
-        for down in range(2 * POSE):
-            band[down, : split - down] = H.diagonal(-down)[: split - down]
-        band[0, :POSE] += self.first_information
-        side[:POSE] -= self.first_information * first
-        side[split:] -= self.prior_information * shared
-        corner = H[:, free].toarray()
-        # A contiguous copy: NumPy multiplies by a slice of the array twenty times more slowly.
-        border, corner = np.asfortranarray(corner[:split]), corner[free] + np.diag(self.prior_information[self.free])
-        return ArrowSystem(band, border, corner, side[:split], side[free])
+        r, at, beacon, k = self.residuals(state), self.at, self.readings.beacon, len(CALIBRATION)
+        n, b, own, free = len(state.poses), len(state.beacons), len(OF_READINGS), np.flatnonzero(self.free)
+        # Squares of the rows of odometry (first pose, second pose, calibration) and of readings (pose, own, beacon).
+        H, g = _squares(r.by_steps, r.odometry_information @ r.by_steps, r.odometry)
+        G, h = _squares(r.by_unknowns, (r.information * weights[:, None])[:, :, None] * r.by_unknowns, r.readings)
+        blocks, below = np.zeros((n, POSE, POSE)), H[:, POSE : 2 * POSE, :POSE]
+        border, corner = np.zeros((n, POSE, self.free.size)), np.zeros((self.free.size, self.free.size))
+        poses, shared = np.zeros((n, POSE)), np.zeros(self.free.size)
+        for first, which in ((0, slice(None, -1)), (POSE, slice(1, None))):
+            rows = slice(first, first + POSE)
+            blocks[which] += H[:, rows, rows]
+            border[which, :, :k] += H[:, rows, 2 * POSE :]
+            poses[which] += g[:, rows]
+        corner[:k, :k], shared[:k] = H[:, 2 * POSE :, 2 * POSE :].sum(axis=0), g[:, 2 * POSE :].sum(axis=0)
+        np.add.at(blocks, at, G[:, :POSE, :POSE])
+        np.add.at(poses, at, h[:, :POSE])
+        np.add.at(border[:, :, k : k + own], at, G[:, :POSE, POSE:-BEACON])
+        of_beacons = border[:, :, len(SHARED) :].reshape(n, POSE, b, BEACON)
+        np.add.at(of_beacons.transpose(0, 2, 1, 3), (at, beacon), G[:, :POSE, -BEACON:])
+        corner[k : k + own, k : k + own] = G[:, POSE:-BEACON, POSE:-BEACON].sum(axis=0)
+        shared[k : k + own] = h[:, POSE:-BEACON].sum(axis=0)
+        across, within, sides = np.zeros((b, own, BEACON)), np.zeros((b, BEACON, BEACON)), np.zeros((b, BEACON))
+        np.add.at(across, beacon, G[:, POSE:-BEACON, -BEACON:])
+        np.add.at(within, beacon, G[:, -BEACON:, -BEACON:])
+        np.add.at(sides, beacon, h[:, -BEACON:])
+        corner[k : k + own, len(SHARED) :] = across.transpose(1, 0, 2).reshape(own, -1)
+        corner[len(SHARED) :, k : k + own] = corner[k : k + own, len(SHARED) :].T
+        for one in range(b):
+            place = slice(len(SHARED) + BEACON * one, len(SHARED) + BEACON * (one + 1))
+            corner[place, place] = within[one]
+        shared[len(SHARED) :] = sides.ravel()
+
+        self._add_priors(state, (blocks[0], border[0], corner), (poses[0], shared))
+        band = _banded(blocks, below)
+        # A Fortran copy: NumPy multiplies by a slice of the array twenty times more slowly.
+        narrow = np.asfortranarray(border.reshape(POSE * n, -1)[:, free])
+        return ArrowSystem(band, narrow, corner[np.ix_(free, free)], poses.ravel(), shared[free])
+
+    def _add_priors(
+        self,
+        state: BatchState,
+        squares: tuple[FloatArray, FloatArray, FloatArray],
+        sides: tuple[FloatArray, FloatArray],
+    ) -> None:
+        """Add the priors to the blocks of first pose, border and corner, and to their right-hand sides."""
+        block, border, corner = squares
+        values = np.concatenate([state.shared, state.beacons.ravel()])
+        corner += np.diag(self.prior_information)
+        sides[1][:] -= self.prior_information * (values - self._prior_mean)
+        if self.marginal is None:
+            block += np.diag(self.first_information)
+            sides[0][:] -= self.first_information * (state.poses[0] - self.first_pose)
+            return
+        L, side = self.marginal.normal_equations(state)
+        block += L[:POSE, :POSE]
+        border += L[:POSE, POSE:]
+        corner += L[POSE:, POSE:]
+        sides[0][:] += side[:POSE]
+        sides[1][:] += side[POSE:]
 
     def spread(self, shared: FloatArray) -> FloatArray:
         """A step of the free shared unknowns as a step of all, (11 + 4 b,), zero for the fixed ones."""
@@ -311,7 +420,7 @@ class BatchProblem:
         by_shared[:, 2, 3], by_shared[:, 2, 4] = 1.0, by_exponent
         # By the measured range, not the predicted one: a variance that depends on the state would bias it outwards.
         variances = np.empty_like(errors)
-        variances[:, 0] = range_variance(radio, self._read[:, 0])
+        variances[:, 0] = range_variance(radio, self._read[:, 0]) * self._range_factor
         variances[:, 1:] = radio.bearing_sigma_rad**2, radio.rssi_sigma_db**2
         information: FloatArray = self.there / (variances * self.repeats[:, None])
         by_unknowns = np.concatenate([by_pose, by_shared, by_beacon], axis=2)
@@ -320,11 +429,33 @@ class BatchProblem:
         )
 
 
-def _rows(blocks: FloatArray, columns: IntArray, width: int) -> csr_array:
-    """A sparse matrix of the blocks (k, r, c), stacked vertically, each in its own columns (k, c)."""
-    k, r, c = blocks.shape
-    starts = np.arange(0, blocks.size + 1, c)
-    return csr_array((blocks.ravel(), np.repeat(columns, r, axis=0).ravel(), starts), shape=(k * r, width))
+def _banded(blocks: FloatArray, below: FloatArray) -> FloatArray:
+    """The band of a matrix with diagonal blocks (n, 3, 3) and the blocks below these, (n - 1, 3, 3)."""
+    n = len(blocks)
+    band = np.zeros((2 * POSE, POSE * n))
+    for column in range(POSE):
+        for row in range(column, POSE):
+            band[row - column, column::POSE] = blocks[:, row, column]
+        for row in range(POSE):
+            band[POSE + row - column, column : POSE * (n - 1) : POSE] = below[:, row, column]
+    return band
+
+
+def of_priors(priors: PriorsConfig, used: BoolArray) -> tuple[BoolArray, FloatArray]:
+    """Which shared unknowns and states of the beacons are estimated, and the information of their priors, (11 + 4 b,).
+
+    A standard deviation of 0 fixes an unknown; places have no prior.
+    """
+    beacons = np.zeros((len(used), BEACON))
+    beacons[used] = (np.inf, np.inf, priors.beacon_offset_m, priors.beacon_reference_db)
+    sigmas = np.concatenate([[getattr(priors, name) for name in SHARED], beacons.ravel()])
+    free = sigmas > 0.0
+    return free, np.where(free, 1.0 / np.where(free, sigmas, 1.0) ** 2, 0.0)
+
+
+def _squares(J: FloatArray, WJ: FloatArray, e: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """J^T W J (k, c, c) and -J^T W e (k, c) of blocks of rows: J and W J (k, r, c), residuals e (k, r)."""
+    return J.transpose(0, 2, 1) @ WJ, -np.einsum("krc,kr->kc", WJ, e)
 
 
 def repeats(readings: Readings, correlation_s: float) -> FloatArray:

@@ -86,6 +86,14 @@ class GaussMarkovBias:
     time_s: float  # correlation time
 
 
+@dataclass(frozen=True, slots=True)
+class LearnedNoise:
+    """Noise of a beacon's ranges: factor on the configured variance, and the part of it that lasts."""
+
+    variance: float
+    bias: GaussMarkovBias
+
+
 _NONE = np.empty(0, dtype=np.intp)
 WANDER = "wander"  # first part of the name of a block that holds a wandering error
 
@@ -101,6 +109,7 @@ class MapEntry:
     time_s: float = 0.0
     fresh: float = 1.0  # variance of the new part of the wandering error, in sigmas squared
     refused: int = 0  # readings refused in a row
+    noise: LearnedNoise | None = None  # of its ranges; None: that of the settings, with the level of all beacons
     on_trial: int = 0  # number of readings that must still agree with the first one; 0: the trial is over
 
 

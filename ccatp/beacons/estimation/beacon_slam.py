@@ -1,8 +1,9 @@
 """EKF-SLAM: estimates the pose of a vehicle and a map of the beacons from odometry and readings."""
 
+import math
 from collections.abc import Iterable, Sequence
 from functools import partial
-from math import log, sqrt
+from math import inf, log, sqrt
 
 import msgspec
 import numpy as np
@@ -15,10 +16,12 @@ from ccatp.beacons.estimation.beacon_map import (
     BeaconMap,
     GaussMarkovBias,
     HeadingTransport,
+    LearnedNoise,
     MapEntry,
     NoiseLevel,
 )
 from ccatp.beacons.estimation.landmark_init import (
+    AGAIN,
     LEAST,
     LINEARISATIONS,
     TRIAL,
@@ -207,6 +210,49 @@ class BeaconSlam:
         self._follow(before)
         return found.nis
 
+    def marginal(
+        self, time_s: float, names: Sequence[str], beacons: Sequence[BeaconId]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pose at a time, (3,), and the covariance of pose, named calibration and places of beacons, (k, k)."""
+        columns = self._columns(names, beacons)
+        pose = self._at(time_s).pose
+        return np.array(pose), self.engine.covariance[np.ix_(columns, columns)].copy()
+
+    def replace(
+        self, time_s: float, names: Sequence[str], beacons: Sequence[BeaconId], mean: FloatArray, covariance: FloatArray
+    ) -> None:
+        """Replace the estimate of the pose at a time, named calibration and places of beacons, in this order."""
+        at, mean = self._at(time_s), mean.copy()
+        mean[:POSE] += self.engine.mean[:POSE] - at.pose  # the state is the pose after the odometry that is due
+        self.engine.replace(self._columns(names, beacons), mean, covariance)
+
+    def likely(self) -> dict[BeaconId, FloatArray]:
+        """Places x_m, y_m of waiting beacons that have one likely place, though readings bend over its width."""
+        found = {}
+        for name, waiting in self.waiting.items():
+            if len(waiting.records) >= LEAST and math.isfinite(waiting.records[-1].reading.range_m):
+                candidate = waiting.found(self.engine, AGAIN)
+                if candidate is not None:
+                    found[name] = candidate.mean[:PLACE]
+        return found
+
+    def join(self, beacon: BeaconId, place_m: FloatArray) -> None:
+        """Put a waiting beacon on the map, with a flat prior about a place, (2,); its waiting readings are dropped."""
+        waiting = self.waiting.pop(beacon)
+        self._map.join(beacon, *self._prior_at(waiting, *place_m.tolist()))
+        waiting.drop(self.engine)
+        self._map.renumber()
+
+    def take_noise(self, beacon: BeaconId, variance: float, share: float, lasts_s: float) -> None:
+        """Use a noise of a beacon's ranges: factor on the configured variance, share that lasts, correlation time."""
+        if beacon in self._map and (share > 0.0 or self._wander is None):
+            self._map[beacon].noise = LearnedNoise(variance, GaussMarkovBias(share, inf, lasts_s))
+
+    def _columns(self, names: Sequence[str], beacons: Sequence[BeaconId]) -> Columns:
+        calibration = [POSE + self._names.index(name) for name in names]
+        starts = [self.engine.block(beacon).start for beacon in beacons]
+        return columns_of(range(POSE), calibration, *((start, start + 1) for start in starts))
+
     def remove(self, beacon: BeaconId) -> None:
         """Remove a beacon; its next reading initialises it again. Raises BlockError: there was no reading of it."""
         if (waiting := self.waiting.pop(beacon, None)) is not None:
@@ -222,7 +268,7 @@ class BeaconSlam:
         engine, name = self.engine, reading.beacon
         kind, z = scalars_of(reading)[-1]
         model = self._models.by_kind[kind]
-        reach_m, at = model.distance_m(z, name), self._carried(reading)
+        reach_m, at = model.distance_m(z, name), self._at(reading.time_s)
         waiting = self.waiting.setdefault(name, PendingLandmark(name))
         record = ReadingRecord(reading, ("place", name, waiting.count), reach_m)
         if reading.bearing_rad is not None:
@@ -289,15 +335,16 @@ class BeaconSlam:
         del self.waiting[waiting.beacon]
         self._map.renumber()
 
-    def _carried(self, reading: Reading) -> CarriedOdometry:
-        """Pose at a reading's time."""
+    def _at(self, time_s: float) -> CarriedOdometry:
+        """Pose at a time."""
         x = self.engine.mean
-        return self._clock.at(x[:POSE].tolist(), reading.time_s, float(x[self._delay]) if self._delay >= 0 else 0.0)
+        return self._clock.at(x[:POSE].tolist(), time_s, float(x[self._delay]) if self._delay >= 0 else 0.0)
 
     def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
         """Process the bearing first; if it is refused, the rest of the reading is refused, too."""
-        if self._wander is not None and not is_direction(reading):
-            self._map.wander_to(reading.beacon, self._wander, self._way_m, reading.time_s)
+        bias = self._wander if entry.noise is None else entry.noise.bias
+        if bias is not None and (bias.share > 0.0 or entry.wander >= 0) and not is_direction(reading):
+            self._map.wander_to(reading.beacon, bias, self._way_m, reading.time_s)
         nis, spread, size, accepted = 0.0, 1.0, 0, True
         for kind, z in scalars_of(reading):
             if accepted:
@@ -338,9 +385,12 @@ class BeaconSlam:
         row = self._models.by_kind[kind].row(at.pose, calibration, beacon, reading.beacon)
         h = [*at.derivatives(*row.pose, delayed=is_delayed), *row.calibration, *row.beacon]
         expected = row.expected
-        r = own = row.variance * self.levels[kind].factor
+        is_learned = entry.noise is not None and kind == "range"
+        bias = entry.noise.bias if entry.noise is not None and is_learned else self._wander
+        level = entry.noise.variance if entry.noise is not None and is_learned else self.levels[kind].factor
+        r = own = row.variance * level
         if entry.wander >= 0:
-            share = 0.0 if self._wander is None or kind == "bearing" else self._wander.share
+            share = 0.0 if bias is None or kind == "bearing" else bias.share
             by_wander = sqrt(share * r)
             h.append(by_wander)
             expected += by_wander * x[-1]

@@ -8,20 +8,20 @@ from math import inf, pi, sqrt
 
 import numpy as np
 
-from ccatp.beacons.config.models import FixedLagConfig, RecordingConfig, SlamFilterConfig
+from ccatp.beacons.config.models import FixedLagConfig, PriorsConfig, RecordingConfig, SlamFilterConfig
 from ccatp.beacons.estimation.beacon_map import HEADING
 from ccatp.beacons.estimation.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
-from ccatp.beacons.estimation.motion import POSE, Increment
+from ccatp.beacons.estimation.motion import Increment
 from ccatp.beacons.estimation.recording import (
     BeaconFix,
     Calibrated,
-    DelayedPath,
     EstimatedPath,
     Reading,
     ReadingInnovation,
     RecordedRun,
     Steps,
 )
+from ccatp.beacons.estimation.window import Window
 from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.core import FloatArray
 
@@ -109,42 +109,6 @@ class HeadingRelocalizer:
         self.best, *self._others = (slams[k] for _, k in kept)
 
 
-class FixedLag:
-    """Copies of recent poses in the filter's state, which each reading corrects, too.
-
-    A fixed-lag smoother by state augmentation (Moore 1973). The copies are a ring buffer, so other blocks keep their
-    columns.
-    """
-
-    def __init__(self, how: FixedLagConfig, slam: BeaconSlam) -> None:
-        self._lag_s, self._count, self._spacing_s = how.lag_s, how.poses, how.lag_s / how.poses
-        self._kept, self._times_s = list[tuple[FloatArray, FloatArray]](), list[float]()
-        for k in range(how.poses):
-            slam.engine.augment((KEPT, k), slam.engine.mean[:POSE].copy(), np.arange(POSE), np.eye(POSE))
-
-    def keep(self, time_s: float, search: HeadingRelocalizer) -> None:
-        """If a copy is due, copy the current pose over the oldest copy, whose estimate is final then."""
-        if self._times_s and time_s < self._times_s[-1] + self._spacing_s:
-            return
-        if len(self._times_s) >= self._count:
-            self._hand_over(search.best)
-        for slam in search.all:
-            slam.engine.copy_states((KEPT, len(self._times_s) % self._count), 0)
-        self._times_s.append(time_s)
-
-    def path(self, slam: BeaconSlam) -> DelayedPath:
-        """The whole delayed path, at the end of the run."""
-        while len(self._kept) < len(self._times_s):
-            self._hand_over(slam)
-        poses, covariances = zip(*self._kept, strict=True)
-        return DelayedPath(self._lag_s, *map(np.array, (self._times_s, poses, covariances)))
-
-    def _hand_over(self, slam: BeaconSlam) -> None:
-        at = slam.engine.block((KEPT, len(self._kept) % self._count))
-        self._kept.append((slam.engine.mean[at].copy(), slam.engine.covariance[at, at].copy()))
-
-
-KEPT = "kept"  # first part of the name of a block that holds the copy of a pose
 FINEST_S = 0.1
 DOUBTFUL_NIS = 1.3  # NIS per degree of freedom above which a warning is given: with learned noise it is one
 DOUBTFUL_JUMPS = 0.003  # pose jumps per reading above which a warning is given
@@ -168,7 +132,7 @@ def follow(
     """
     sigmas = cfg.priors.pose_m, cfg.priors.pose_m, cfg.priors.heading_rad
     search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, np.diag(np.square(sigmas))))
-    window = None if lag is None else FixedLag(lag, search.best)
+    window = None if lag is None else Window(run, cfg, how, lag)
     times = np.union1d(_spaced(run.steps.times_s, finest_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), list(_readings(run, cfg.radio.camera_field_rad))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
@@ -180,14 +144,18 @@ def follow(
             search.predict(increments[k - 1])
         predicted_s = clock_s()
         log.predict_s.append(predicted_s - begin_s)
-        if window is not None:
-            window.keep(float(times[k]), search)
         if now := readings[begin:end]:
             log.take(float(times[k]), search.observe(now), len(now), clock_s() - predicted_s)
         poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
-    delayed = None if window is None else window.path(search.best)
-    path = _result(run, search.best, log)
-    return path._replace(times_s=times, poses=poses, covariances=covariances, delayed=delayed), search.best
+        if window is not None:
+            window.step(float(times[k]), search.all, times[: k + 1], poses[: k + 1])
+            poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
+    delayed = None if window is None else window.delayed(search.best, times, poses, covariances)
+    path = _result(run, search.best, log, cfg.priors if window is None else window.priors)
+    found = () if window is None else window.findings()
+    return path._replace(
+        times_s=times, poses=poses, covariances=covariances, delayed=delayed, warnings=(*path.warnings, *found)
+    ), search.best
 
 
 class _Log:
@@ -208,15 +176,17 @@ class _Log:
             self.scalar_s += [lasted_s / scalars] * scalars
 
 
-def _result(run: RecordedRun, slam: BeaconSlam, log: _Log) -> EstimatedPath:
-    """The result without the path, which is empty."""
+def _result(run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig) -> EstimatedPath:
+    """The result without the path, which is empty; ``assumed``: the priors of the calibration in use."""
     used = [one for one in log.learned if one.accepted]
     refused = len(log.learned) - len(used)
     nis, sizes = np.array([(one.nis, float(one.size)) for one in used]).reshape(-1, 2).T
     priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
     # Only values that the readings have determined at least in part.
     calibration = {
-        name: Calibrated(*found) for name, found in slam.calibration.items() if found[1] < UNCHANGED * priors[name]
+        name: Calibrated(*found)
+        for name, found in slam.calibration.items()
+        if found[1] < UNCHANGED * getattr(assumed, name)
     }
     beacons, none = slam.beacons.items(), np.empty(0)
     at = columns_of(*((first := slam.engine.block(name).start, first + 1) for name, _ in beacons))

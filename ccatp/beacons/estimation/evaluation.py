@@ -6,7 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, RecordedRun, ReferencePath
+from ccatp.beacons.estimation.recording import (
+    BeaconFix,
+    EstimatedPath,
+    RecordedRun,
+    ReferencePath,
+    dead_reckoned,
+)
 from ccatp.beacons.rigid_motion import RigidMotion, best_motion
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import Consistency, consistency, nees, rms, wrapped
@@ -103,6 +109,16 @@ def _nees(track: EstimatedPath, truth: FloatArray, known: np.ndarray) -> Consist
     return consistency(squares, np.full(squares.size, float(size)))
 
 
+RECKONING = "dead reckoning"
+
+
+def reckoned_track(run: RecordedRun) -> EstimatedPath:
+    """The path by odometry alone, from the first pose; its covariances have no meaning."""
+    poses = dead_reckoned(run.steps, run.first_pose)
+    unknown = np.broadcast_to(np.eye(3), (len(poses), 3, 3))
+    return EstimatedPath(run.steps.times_s, poses, unknown, {}, {}, refused=0, updates=0, warnings=())
+
+
 SCALES = ("range_scale", "distance_scale", "turn_scale")  # shown as factors: 1.07 if ranges are 7 % too long
 
 
@@ -128,6 +144,7 @@ def result_data(run: RecordedRun, filter_name: str, track: EstimatedPath, judged
         "nis_band": None if nis is None else [nis.low, nis.high],
         "nees_mean": None if nees is None else nees.mean,
         "delayed": _delayed(run, track),
+        "dead_reckoning_rmse_m": _finite(judge(reckoned_track(run), run).trajectory_rmse_m),
         "updates": track.updates,
         "refused": track.refused,
         "update_us_p50": _median_us(track.update_s),
@@ -159,6 +176,7 @@ def table_lines(run: RecordedRun, data: dict[str, Any]) -> list[str]:
         ("data", f"{data['dataset']} ({data['format']}): {span_s:.0f} s, {way_m:.0f} m by odometry, {readings}"),
         ("filter", f"{data['filter']}: {data['updates']} updates, {data['refused']} refused"),
         ("path", _errors(data)),
+        ("by odometry", _number(data["dead_reckoning_rmse_m"], "{:.3f} m rms, dead reckoning")),
         ("beacons", _number(data["beacon_rmse_m"], "{:.3f} m rms")),
     ]
     if (late := data["delayed"]) is not None:

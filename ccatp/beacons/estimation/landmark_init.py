@@ -48,6 +48,20 @@ LINEARISATIONS = 8  # largest number; Gauss-Newton converges within five
 TRIAL = 2  # number of readings that must agree with the first one: a misread name would give any place
 
 
+class JoinLimits(NamedTuple):
+    """What a candidate must satisfy to be a beacon."""
+
+    across: float  # largest standard deviation across the line of sight, relative to the distance
+    along: float  # the same along it
+    bend: float
+    margin: float
+
+
+ONCE = JoinLimits(TIGHT, DEEP, BEND, MARGIN)  # where readings are linearised once
+# Where readings are linearised again, the arc may be longer, and a mirror image is found out by later readings.
+AGAIN = JoinLimits(0.25, DEEP, inf, 16.0)
+
+
 class ReadingRecord(NamedTuple):
     """A reading that waits."""
 
@@ -175,7 +189,7 @@ class PendingLandmark:
                 return x + distance_m * cos(way_rad), y + distance_m * sin(way_rad)
         return None
 
-    def found(self, engine: EkfSlam) -> Candidate | None:
+    def found(self, engine: EkfSlam, limits: JoinLimits = ONCE) -> Candidate | None:
         """The best candidate with the variances to use; None unless it is unique, accurate and fits the readings."""
         if not self.candidates:
             return None
@@ -185,16 +199,16 @@ class PendingLandmark:
         along, across = sight / distance, np.array((-sight[1], sight[0])) / distance
         C = best.covariance[:2, :2]
         loose = min(max(self.count / MOST, 1.0), LOOSEST)
-        tight = TIGHT * loose
-        if best.bend > BEND * loose:
+        if best.bend > limits.bend * loose:
             return None
-        if across.dot(C).dot(across) > (tight * distance) ** 2 or along.dot(C).dot(along) > (DEEP * distance) ** 2:
+        widths = (across, limits.across * loose), (along, limits.along)
+        if any(way.dot(C).dot(way) > (limit * distance) ** 2 for way, limit in widths):
             return None
         m = len(self.records)
         excess = max(1.0, best.cost / (m - best.mean.size))
         if best.cost > m + FIT * sqrt(2.0 * m) and self.count <= MOST:
             return None
-        if any(other.cost - best.cost < MARGIN * excess for other in self.candidates[1:]):
+        if any(other.cost - best.cost < limits.margin * excess for other in self.candidates[1:]):
             return None
         return best._replace(variances=excess * best.variances)
 

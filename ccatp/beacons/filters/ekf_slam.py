@@ -147,6 +147,24 @@ class EkfSlam:
         P[to] = P[source]
         P[:, to] = P[:, source]
 
+    def replace(self, columns: Columns, mean: FloatArray, covariance: FloatArray) -> None:
+        """Replace the estimate of different ``columns`` (k,) by mean (k,) and covariance (k, k) from all that is known.
+
+        All other states keep their regression on these, G = P_ox P_xx^-1, and what it leaves: x_o <- x_o + G (new -
+        old) and P_oo <- P_oo + G (new P_xx - old P_xx) G^T.
+        """
+        P = self.covariance
+        old = P[np.ix_(columns, columns)]
+        scale = 1.0 / np.sqrt(old.diagonal())
+        G = np.linalg.solve(scale * old * scale[:, None], scale[:, None] * P[columns]).T * scale
+        G[columns] = np.eye(columns.size)
+        x = self.mean + G.dot(mean - self.mean[columns])
+        full = P + G.dot(covariance - old).dot(G.T)
+        if not float(np.vdot(full, full) + np.vdot(x, x)) < HUGE:
+            raise FilterDiverged("replaced estimate is not finite")
+        self.mean[:] = x
+        P[:] = 0.5 * (full + full.T)
+
     def relax(self, index: int, factor: float, variance: float) -> None:
         """Predict one state as a Gauss-Markov process: x <- factor x + noise; ``factor`` 0 to 1."""
         n = self.size

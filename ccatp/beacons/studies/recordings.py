@@ -19,7 +19,7 @@ from ccatp.beacons.datasets.checks import survey_doubts
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
 from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
 from ccatp.beacons.estimation.causal import filter_run
-from ccatp.beacons.estimation.evaluation import judge, result_data
+from ccatp.beacons.estimation.evaluation import RECKONING, judge, reckoned_track, result_data
 from ccatp.beacons.estimation.level_fix import LevelLocator, fingerprint_fits, grid_points, judged
 from ccatp.beacons.estimation.path_loss import fit_path_loss
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
@@ -70,12 +70,12 @@ COMPARED = (
 
 
 def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[str]], None]) -> list[dict[str, Any]]:
-    """A row of ``COMPARED`` for each of our estimators and GTSAM's.
+    """A row of ``COMPARED`` for dead reckoning, each of our estimators, and GTSAM's.
 
     If GTSAM fails, its rows have no values, and there is a warning. Raises PeerError: GTSAM is not installed.
     """
     import_gtsam()  # fails before the computation
-    tracks: list[tuple[str, EstimatedPath | None, float | None]] = []
+    tracks: list[tuple[str, EstimatedPath | None, float | None]] = [(RECKONING, reckoned_track(run), None)]
     for name in FILTERS:
         begin_s = perf_counter()
         tracks.append((name, estimate(run, assumed, name), perf_counter() - begin_s))
@@ -89,7 +89,7 @@ def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[s
     rows = []
     for name, track, run_s in tracks:
         data = {} if track is None else result_data(run, name, track, judge(track, run))
-        if name in PEERS:
+        if name not in FILTERS:
             data["nees_mean"] = None  # covariances of the peers are not computed
         known = {"dataset": run.name, "filter": name, "run_s": run_s, "gave_up": track is None}
         rows.append({key: data.get(key) for key in COMPARED} | known)

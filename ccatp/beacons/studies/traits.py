@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ccatp.beacons.config.models import RecordingsConfig
-from ccatp.beacons.estimation.evaluation import judge, truth_at
-from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, dead_reckoned
+from ccatp.beacons.estimation.evaluation import RECKONING, judge, reckoned_track, truth_at
+from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, run_gtsam
 from ccatp.beacons.studies.recordings import FILTERS, PEERS, EstimateError, estimate
 from ccatp.beacons.studies.trait_runs import TRAITS, trait_run
@@ -17,7 +17,7 @@ from ccatp.filters.metrics import nees
 from ccatp.missions import Part
 from ccatp.studies.campaign import Cell, Factors, Job, JobOutcome, Study
 
-PLAIN, RECKONING = "plain", "dead reckoning"
+PLAIN = "plain"
 _INSIDE = 5.991  # chi-squared of two degrees of freedom, 95 %
 
 
@@ -44,9 +44,7 @@ def _track(run: RecordedRun, cfg: RecordingsConfig, estimator: str) -> Estimated
         return estimate(run, cfg, estimator)
     if estimator in PEERS:
         return run_gtsam(run, cfg.csv, perf_counter)[PEERS.index(estimator)]
-    poses = dead_reckoned(run.steps, run.first_pose)
-    unknown = np.broadcast_to(np.eye(3), (len(poses), 3, 3))
-    return EstimatedPath(run.steps.times_s, poses, unknown, {}, {}, refused=0, updates=0, warnings=())
+    return reckoned_track(run)
 
 
 def _covered(track: EstimatedPath, run: RecordedRun) -> float | None:

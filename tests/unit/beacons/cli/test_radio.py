@@ -141,9 +141,9 @@ def test_an_estimator_that_finds_nothing(
     def diverging(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("ccatp.beacons.studies.recordings.filter_run", diverging)
+    monkeypatch.setattr("ccatp.beacons.studies.recordings.lagged_run", diverging)
     assert main(["radio", "slam", str(recording)]) == 2
-    assert f"mine: ekf-slam finds no finite map for these data ({error})" in capsys.readouterr().err.splitlines()[-1]
+    assert f"mine: fixed-lag finds no finite map for these data ({error})" in capsys.readouterr().err.splitlines()[-1]
 
 
 XBEE = RADIO_DATA / "xbee_rssi"
@@ -266,7 +266,7 @@ def test_slam_with_peers_prints_all_side_by_side(tmp_path: Path, capsys: pytest.
         line for line in printed(capsys, "radio", "slam", file, "--peers").splitlines() if line.startswith("| mine")
     ]
     names = [line.split("|")[2].strip() for line in rows]
-    assert names == ["ekf-slam", "fixed-lag", "smoother", "GTSAM iSAM2", "GTSAM batch"]
+    assert names == ["dead reckoning", "ekf-slam", "fixed-lag", "smoother", "GTSAM iSAM2", "GTSAM batch"]
 
 
 def test_a_peer_that_gives_up_leaves_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -276,5 +276,5 @@ def test_a_peer_that_gives_up_leaves_the_table(tmp_path: Path, capsys: pytest.Ca
     out, err = capsys.readouterr()
     rows = [[cell.strip() for cell in line.split("|")[2:-1]] for line in out.splitlines() if line.startswith("| bear")]
     assert [row[0] for row in rows if row[-1] == "True"] == ["GTSAM iSAM2", "GTSAM batch"]
-    assert len(rows) == 5
+    assert len(rows) == 6
     assert "warning: bearings: not all readings have a range" in err

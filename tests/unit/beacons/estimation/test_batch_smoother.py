@@ -19,8 +19,9 @@ from ccatp.beacons.estimation.batch_problem import (
     Reckoning,
     repeats,
 )
-from ccatp.beacons.estimation.batch_smoother import Factored, smooth, t_cost, t_weights
+from ccatp.beacons.estimation.batch_smoother import smooth
 from ccatp.beacons.estimation.evaluation import judge, truth_at
+from ccatp.beacons.estimation.least_squares import Factored, t_cost, t_weights
 from ccatp.beacons.estimation.recording import (
     BeaconFix,
     EstimatedPath,

@@ -384,34 +384,9 @@ def test_a_twentieth_of_the_readings_refused_is_reported() -> None:
         assert any("readings were refused" in line for line in track.warnings) == is_told
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_fixed_lag_gives_what_the_smoother_of_all_readings_up_to_its_end_gives(seed: int) -> None:
-    """With noise as it is set and no outliers both are least squares; they differ by where they are linearised."""
-    run, lag = recorded(world(seed)), FixedLagConfig(lag_s=10.0, poses=10, map_s=3600.0)
-    given = SETTINGS.but(
-        **trust(100.0, 100.0, 0.0, 5.0, 3, 20), radio__bearing_sigma_rad=0.02, radio__freedom=1e6,
-        priors__turn_per_m=0.0,
-    )  # fmt: skip
-    track = lagged_run(run, *given, no_clock, lag)
-    causal = filter_run(run, *given, no_clock)
-    np.testing.assert_allclose(track.poses, causal.poses, atol=1e-9)
-    assert track.delayed is not None
-    _, times_s, poses, covariances = track.delayed
-    for k in (20, 35, 45, -1):
-        end_s = times_s[k] + lag.lag_s
-        upto = replace(run, readings=run.readings.where(run.readings.times_s <= end_s))
-        smoothed = smooth(upto, *given, no_clock)
-        at = int(np.argmin(np.abs(smoothed.times_s - times_s[k])))
-        assert smoothed.times_s[at] == pytest.approx(times_s[k], abs=0.05)
-        expected = [np.interp(times_s[k], smoothed.times_s, column) for column in smoothed.poses.T]
-        sigmas = np.sqrt(np.diag(covariances[k]))
-        assert np.all(np.abs(poses[k] - expected) < 0.3 * sigmas)
-        assert sigmas == pytest.approx(np.sqrt(np.diag(smoothed.covariances[at])), rel=0.15)
-
-
 def test_the_map_of_a_fixed_lag_fits_all_that_is_kept_in_the_frame_of_its_path() -> None:
     run, given = recorded(world(1)), (CONFIG.csv, CONFIG.filter)
-    lag = FixedLagConfig(lag_s=10.0, poses=10, map_s=3600.0)
+    lag = FixedLagConfig(lag_s=10.0, poses=10, window_s=120.0, map_s=3600.0)
     causal, whole = filter_run(run, *given, no_clock), smooth(run, *given, no_clock)
     track = lagged_run(run, *given, no_clock, lag)
     assert track.beacons.keys() == causal.beacons.keys()

@@ -3,7 +3,8 @@
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
-from ccatp.beacons.studies.traits import PLAIN, RECKONING, combine_traits, run_trait, trait_cells
+from ccatp.beacons.estimation.evaluation import RECKONING
+from ccatp.beacons.studies.traits import PLAIN, combine_traits, run_trait, trait_cells
 from ccatp.studies.campaign import Job, JobOutcome
 
 CFG = load_recordings_config()

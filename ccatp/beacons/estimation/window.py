@@ -1,0 +1,308 @@
+"""The fixed-lag smoother: the filter between solutions of a window of recent readings that are linearised again.
+
+The window is a ``BatchProblem`` of the readings of the last minutes, with a ``MarginalPrior`` of what came before. It
+is solved when it has grown by a share, and whenever a beacon has joined. Its result replaces the filter's estimate of
+pose, calibration and beacons. What the filter alone has in its state (readings that wait, errors that last) keeps its
+relation to these.
+"""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import LinAlgError
+
+from ccatp.beacons.config.models import FixedLagConfig, PriorsConfig, RecordingConfig, SlamFilterConfig
+from ccatp.beacons.estimation.batch_problem import (
+    BEACON,
+    SHARED,
+    BatchProblem,
+    BatchState,
+    BeaconNoise,
+    MarginalPrior,
+    of_priors,
+)
+from ccatp.beacons.estimation.beacon_slam import BeaconSlam
+from ccatp.beacons.estimation.least_squares import Factored, descend, eliminated, t_weights
+from ccatp.beacons.estimation.motion import POSE
+from ccatp.beacons.estimation.range_noise import range_noise
+from ccatp.beacons.estimation.recording import BeaconId, BoolArray, DelayedPath, RecordedRun, Steps
+from ccatp.core import FloatArray
+
+SPACING_S = 0.5  # longest interval between poses without readings
+SOONEST_S = 1.0  # shortest interval between solutions
+GROWTH = 0.1  # of the window between solutions: the filter's linearisations last that long
+KEPT = 0.75  # share of the longest window that is kept when its beginning is marginalised
+ITERATIONS = 12
+ENOUGH = 1e-4  # relative decrease of the cost at which it has converged; the next solution goes on from there
+REPORTED = 3.0  # readings that count as one, above which that is reported
+EARLIER_S = 2.0  # of odometry before the window, for its delay
+
+
+# Share of a calibration's prior that it has until the readings want the whole of it: the priors of a format are for
+# the worst instrument of its kind.
+NARROW = 0.5
+SURE = 1.0  # logarithm of the ratio of evidence above which they do
+
+
+def narrowed(priors: PriorsConfig, wide: Collection[str]) -> PriorsConfig:
+    """Priors with a part of the standard deviation of each calibration that is not in ``wide``."""
+    return priors.model_copy(update={name: NARROW * getattr(priors, name) for name in SHARED if name not in wide})
+
+
+class _Solved(NamedTuple):
+    problem: BatchProblem
+    state: BatchState
+    factored: Factored
+    times_s: FloatArray
+
+
+class Window:
+    """Solves the window and corrects a ``BeaconSlam``; ``delayed`` is the path as estimated ``lag_s`` later."""
+
+    def __init__(self, run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, lag: FixedLagConfig) -> None:
+        self._run, self._lag, self._spacing_s = run, lag, lag.lag_s / lag.poses
+        self._rest = how.rest_speed_m_s, how.rest_turn_rad_s
+        self._readings = run.readings.with_distances(cfg.radio.camera_field_rad)
+        steps_s = run.steps.times_s
+        _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
+        self._grid_s = steps_s[first]
+        self._begin_s, self._solved_s = float(steps_s[0]), float(steps_s[0])
+        self._marginal: MarginalPrior | None = None
+        self._last: _Solved | None = None
+        self._seen: tuple[object, ...] = (0, 0)
+        self._noise = BeaconNoise.configured(len(run.beacon_ids))
+        self._wide, self._cfg = cfg.priors, cfg.model_copy(update={"priors": narrowed(cfg.priors, ())})
+        self._due_s, self._placed = self._begin_s, frozenset[str]()
+        self._delayed = list[tuple[float, FloatArray, FloatArray]]()
+
+    def step(self, time_s: float, slams: Sequence[BeaconSlam], times_s: FloatArray, poses: FloatArray) -> None:
+        """Solve the window if that is due, and correct the filter.
+
+        ``slams``: all hypotheses of the filter, the best one first. ``times_s``, ``poses``: the filter's path up to
+        now, shapes (k,) and (k, 3).
+        """
+        slam = slams[0]
+        events = (slam.jumps, len(slam.moved))
+        if len(slams) > 1 or events != self._seen:  # the past of this window is not that of the filter any more
+            self._restart(time_s, slam)
+            self._seen = events
+            return
+        if time_s < self._solved_s + SOONEST_S:
+            return
+        placed = frozenset(map(str, slam.beacons))
+        joins = not placed <= self._placed or bool(slam.likely())
+        self._solved_s = time_s if joins or not placed else self._solved_s
+        if joins or (placed and time_s >= self._due_s):
+            self.solve(time_s, slam, times_s, poses)
+            self._placed = frozenset(map(str, slam.beacons))
+
+    def solve(self, time_s: float, slam: BeaconSlam, times_s: FloatArray, poses: FloatArray) -> None:
+        """Solve the window, and correct the filter."""
+        self._solved_s = time_s
+        self._due_s = time_s + max(SOONEST_S, GROWTH * (time_s - self._begin_s))
+        likely = slam.likely()
+        solved = self._solution(time_s, slam, likely, times_s, poses)
+        if solved is None:
+            return
+        for name in likely:
+            slam.join(name, solved.state.beacons[self._run.beacon_ids.index(str(name)), :2])
+        self._last = solved
+        self._correct(slam, solved, time_s)
+        self._widen(solved)
+        self._noise = range_noise(solved.problem, solved.state)
+        for k, name in enumerate(self._run.beacon_ids):
+            slam.take_noise(name, *(float(column[k]) for column in (self._noise.variance, *self._noise[2:])))
+        self._hand_over(time_s - self._lag.lag_s)
+        if time_s - self._begin_s > self._lag.window_s:
+            self._marginalise(time_s - KEPT * self._lag.window_s)
+
+    def delayed(self, slam: BeaconSlam, times_s: FloatArray, poses: FloatArray, covariances: FloatArray) -> DelayedPath:
+        """Solve once more, at the end of the run: the whole delayed path.
+
+        Before the first window it is the filter's path, which is given.
+        """
+        if self._last is not None:
+            self.solve(float(times_s[-1]), slam, times_s, poses)
+        self._hand_over(np.inf)
+        begin_s = self._delayed[0][0] if self._delayed else np.inf
+        early, next_s = [], -np.inf
+        for k, time_s in enumerate(times_s.tolist()):
+            if next_s <= time_s < begin_s:
+                early.append((time_s, poses[k], covariances[k]))
+                next_s = time_s + self._spacing_s
+        return DelayedPath(self._lag.lag_s, *map(np.array, zip(*early, *self._delayed, strict=True)))
+
+    @property
+    def priors(self) -> PriorsConfig:
+        """The priors in use: narrow where the readings do not want the whole one; as configured before a solution."""
+        return self._wide if self._last is None else self._cfg.priors
+
+    def findings(self) -> Iterator[str]:
+        """What was found of the noise, and what was done about it."""
+        names = [(name, k) for k, name in enumerate(self._run.beacon_ids) if self._noise.repeats[k] > REPORTED]
+        for name, k in names:
+            yield (
+                f"range errors of beacon {name} last for {self._noise.lasts_s[k]:.1f} s: {self._noise.repeats[k]:.0f} "
+                "of its readings count as one"
+            )
+
+    # -- the window ---------------------------------------------------------------------------------------------------
+
+    def _steps(self, begin_s: float, end_s: float) -> Steps:
+        steps = self._run.steps
+        first = max(int(np.searchsorted(steps.times_s, begin_s - EARLIER_S, side="right")) - 1, 0)
+        last = min(int(np.searchsorted(steps.times_s, end_s)), steps.times_s.size - 1)
+        rows = (np.broadcast_to(row, steps.distance_m.shape)[first:last] for row in steps[1:])
+        return Steps(steps.times_s[first : last + 1], *rows)
+
+    def _problem(self, begin_s: float, end_s: float, used: BoolArray, *, from_begin: bool) -> BatchProblem:
+        """Of the readings after ``begin_s`` (or at it, at the beginning of the run) up to ``end_s``."""
+        r = self._readings
+        inside = (r.times_s <= end_s) & ((r.times_s >= begin_s) if from_begin else (r.times_s > begin_s))
+        readings = r.where(inside)
+        grid_s = self._grid_s[(self._grid_s > begin_s) & (self._grid_s < end_s)]
+        times_s = np.union1d(np.union1d(readings.times_s, grid_s), (begin_s, end_s))
+        steps = self._steps(begin_s, end_s)
+        return BatchProblem(
+            steps, readings, times_s, self._run.first_pose, self._cfg, used, self._rest, self._marginal,
+            self._noise,
+        )  # fmt: skip
+
+    def _solution(
+        self, time_s: float, slam: BeaconSlam, likely: Mapping[BeaconId, FloatArray], times_s: FloatArray,
+        poses: FloatArray,
+    ) -> _Solved | None:  # fmt: skip
+        used = np.array([name in slam.beacons or name in likely for name in self._run.beacon_ids])
+        if self._marginal is not None:
+            used |= self._marginal.known
+        problem = self._problem(self._begin_s, time_s, used, from_begin=self._marginal is None)
+        start = self._start(problem, slam, times_s, poses)
+        for name, place_m in likely.items():
+            start.beacons[self._run.beacon_ids.index(str(name)), :2] = place_m
+        try:
+            state, _ = descend(problem, start, ITERATIONS, enough=ENOUGH)
+            weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)
+            factored = Factored(problem.normal_equations(state, weights * problem.power))
+        except LinAlgError:
+            return None  # these readings do not determine the beacons: the filter goes on alone
+        return _Solved(problem, state, factored, problem.times_s)
+
+    def _start(self, problem: BatchProblem, slam: BeaconSlam, times_s: FloatArray, poses: FloatArray) -> BatchState:
+        """The last solution, with the filter's path since then and the beacons that have joined."""
+        at_s, last = problem.times_s, self._last
+        filtered = np.column_stack([np.interp(at_s, times_s, column) for column in poses.T])
+        shared = np.zeros(len(SHARED)) if last is None else last.state.shared.copy()
+        beacons = np.zeros((len(self._run.beacon_ids), BEACON)) if last is None else last.state.beacons.copy()
+        if last is not None:
+            old = at_s <= last.times_s[-1]
+            filtered[old] = np.column_stack([np.interp(at_s[old], last.times_s, c) for c in last.state.poses.T])
+        for name, (value, _) in slam.calibration.items():
+            shared[SHARED.index(name)] = value
+        for k, name in enumerate(self._run.beacon_ids):
+            if name in slam.beacons:
+                beacons[k, :2] = slam.beacons[name].mean[:2]
+        return BatchState(filtered, shared, beacons)
+
+    def _correct(self, slam: BeaconSlam, solved: _Solved, time_s: float) -> None:
+        """Replace the filter's estimate by that of the window."""
+        whole = np.zeros((POSE + solved.problem.free.size,) * 2)
+        free = np.concatenate([np.ones(POSE, dtype=bool), solved.problem.free])
+        whole[np.ix_(free, free)] = solved.factored.covariance_at(-1)
+        names = [name for name in slam.calibration if solved.problem.free[SHARED.index(name)]]
+        rows = [*range(POSE), *(POSE + SHARED.index(name) for name in names)]
+        placed = [k for k, name in enumerate(self._run.beacon_ids) if name in slam.beacons]
+        for k in placed:
+            start = POSE + len(SHARED) + BEACON * k
+            rows += (start, start + 1)
+        values = np.concatenate([solved.state.poses[-1], solved.state.shared, solved.state.beacons.ravel()])
+        slam.replace(time_s, names, [self._run.beacon_ids[k] for k in placed], values[rows], whole[np.ix_(rows, rows)])
+
+    def _widen(self, solved: _Solved) -> None:
+        """Give a calibration its whole prior if the readings want that, else a narrow one.
+
+        With z what the readings alone tell of it, and 1 / I their variance, the evidence for a prior of the standard
+        deviation s is N(z; 0, s^2 + 1 / I). Where the readings tell little, both are the same, and it stays narrow.
+        """
+        problem, shared = solved.problem, np.flatnonzero(solved.problem.free[: len(SHARED)]).tolist()
+        variances = np.diag(solved.factored.shared_covariance())
+        wide = list[str]()
+        for at, k in enumerate(shared):
+            told = 1.0 / variances[at] - problem.assumed_information[k]
+            sigma = float(getattr(self._wide, SHARED[k]))
+            if told * sigma * sigma < 1.0:
+                continue
+            z = float(solved.state.shared[k]) / float(variances[at] * told)
+            spreads = np.array((sigma, NARROW * sigma)) ** 2 + 1.0 / told
+            whole, little = (-0.5 * (np.log(spreads) + z * z / spreads)).tolist()
+            if whole > little + SURE:
+                wide.append(SHARED[k])
+        self._cfg = self._cfg.model_copy(update={"priors": narrowed(self._wide, wide)})
+
+    def _marginalise(self, before_s: float) -> None:
+        """Keep what the readings up to a pose of the window tell as a prior, and begin there."""
+        last = self._last
+        if last is None:
+            return
+        at = int(np.searchsorted(last.times_s, before_s))
+        cut_s = float(last.times_s[at])
+        head = self._problem(self._begin_s, cut_s, last.problem.used, from_begin=self._marginal is None)
+        poses = np.column_stack([np.interp(head.times_s, last.times_s, c) for c in last.state.poses.T])
+        state = BatchState(poses, last.state.shared, last.state.beacons)
+        weights = t_weights(head.residuals(state).chi2, head.sizes, head.radio.freedom)
+        information, side = eliminated(head.normal_equations(state, weights * head.power))
+        assumed, values = head.assumed_information[head.free], np.concatenate([state.shared, state.beacons.ravel()])
+        information[POSE:, POSE:] -= np.diag(assumed)  # the priors stay where they are
+        side[POSE:] += assumed * values[head.free]
+        self._begin(cut_s, state, last.problem.used, head.free, information, side)
+
+    def _begin(
+        self, begin_s: float, state: BatchState, known: BoolArray, free: BoolArray, information: FloatArray,
+        side: FloatArray,
+    ) -> None:  # fmt: skip
+        kept = np.concatenate([np.ones(POSE, dtype=bool), free])
+        whole, g = np.zeros((kept.size, kept.size)), np.zeros(kept.size)
+        whole[np.ix_(kept, kept)], g[kept] = information, side
+        self._marginal = MarginalPrior.made(state, -1, known, whole, g)
+        self._begin_s = begin_s
+
+    def _restart(self, time_s: float, slam: BeaconSlam) -> None:
+        """Begin a window now, with the filter's estimate as its prior."""
+        self._hand_over(np.inf)
+        used = np.array([name in slam.beacons for name in self._run.beacon_ids])
+        names, placed = list(slam.calibration), np.flatnonzero(used).tolist()
+        shared, beacons = np.zeros(len(SHARED)), np.zeros((len(used), BEACON))
+        rows = [*range(POSE), *(POSE + SHARED.index(name) for name in names)]
+        for k in placed:
+            start = POSE + len(SHARED) + BEACON * k
+            rows += (start, start + 1)
+            beacons[k, :2] = slam.beacons[self._run.beacon_ids[k]].mean[:2]
+        for name, (value, _) in slam.calibration.items():
+            shared[SHARED.index(name)] = value
+        pose, P = slam.marginal(time_s, names, [self._run.beacon_ids[k] for k in placed])
+        size = POSE + len(SHARED) + beacons.size
+        information = np.zeros((size, size))
+        information[np.ix_(rows, rows)] = np.linalg.inv(P)
+        # The filter's calibration has priors, which stay where they are.
+        assumed = np.zeros(size)
+        own = rows[POSE : POSE + len(names)]
+        assumed[own] = of_priors(self._cfg.priors, used)[1][np.array(own, dtype=int) - POSE]
+        values, vectors = np.linalg.eigh(information - np.diag(assumed))
+        information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        side = np.concatenate([np.zeros(POSE), shared, beacons.ravel()]) * assumed
+        state = BatchState(pose[None, :], shared, beacons)
+        self._marginal = MarginalPrior.made(state, -1, used, information, side)
+        self._begin_s = self._solved_s = time_s
+        self._due_s, self._last, self._placed = time_s + SOONEST_S, None, frozenset(map(str, slam.beacons))
+
+    def _hand_over(self, until_s: float) -> None:
+        """Keep poses of the last solution, evenly spaced, as the delayed path."""
+        last = self._last
+        if last is None:
+            return
+        for k, time_s in enumerate(last.times_s.tolist()):
+            if time_s > until_s:
+                return
+            if not self._delayed or time_s >= self._delayed[-1][0] + self._spacing_s:
+                covariance = last.factored.covariance_at(k)[:POSE, :POSE]
+                self._delayed.append((time_s, last.state.poses[k].copy(), covariance))

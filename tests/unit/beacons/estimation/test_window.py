@@ -1,0 +1,179 @@
+"""The fixed-lag smoother: its window beside the smoother of the whole run, what is marginalised, and learned noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.config.load import load_recordings_config
+from ccatp.beacons.config.models import FixedLagConfig
+from ccatp.beacons.estimation.batch_problem import BEACON, SHARED, BatchState, MarginalPrior
+from ccatp.beacons.estimation.batch_smoother import smooth
+from ccatp.beacons.estimation.causal import filter_run, follow
+from ccatp.beacons.estimation.evaluation import judge
+from ccatp.beacons.estimation.least_squares import Factored, eliminated
+from ccatp.beacons.estimation.range_noise import correlations, readings_as_one
+from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
+from ccatp.beacons.filters.ekf_slam import EkfSlam
+from ccatp.beacons.studies.trait_runs import trait_run
+from ccatp.core import FloatArray
+from tests.support.slam_settings import Settings, odometry, settings, trust
+from tests.unit.beacons.datasets.sets import recorded, world
+from tests.unit.beacons.estimation.test_batch_smoother import problem
+
+CONFIG = load_recordings_config()
+LAG = FixedLagConfig(lag_s=10.0, poses=10, window_s=1e4, map_s=3600.0)
+PLAIN = settings(
+    **trust(100.0, 100.0, 0.0, 5.0, 3, 20), **odometry(0.01, 0.0, 0.005, 0.005, 0.0, 0.0), radio__range_sigma_m=0.05,
+    radio__bearing_sigma_rad=0.02, radio__freedom=1e6,
+)  # fmt: skip
+
+
+def no_clock() -> float:
+    """Time stands still."""
+    return 0.0
+
+
+def estimated(run: RecordedRun, given: Settings, lag: FixedLagConfig) -> EstimatedPath:
+    return follow(run, *given, no_clock, lag=lag)[0]
+
+
+def test_a_window_of_the_whole_run_gives_at_its_end_what_the_smoother_gives() -> None:
+    run = recorded(world(2))
+    track, smoothed = estimated(run, PLAIN, LAG), smooth(run, *PLAIN, no_clock)
+    assert track.delayed is not None
+    _, times_s, poses, covariances = track.delayed
+    for k in (5, 20, -1):
+        at = int(np.argmin(np.abs(smoothed.times_s - times_s[k])))
+        expected = [np.interp(times_s[k], smoothed.times_s, column) for column in smoothed.poses.T]
+        sigmas = np.sqrt(np.diag(smoothed.covariances[at]))
+        # Before the end the smoother has later readings, too.
+        assert np.all(np.abs(poses[k] - expected) < (0.2 if k == -1 else 1.5) * sigmas)
+        assert np.sqrt(np.diag(covariances[k])) == pytest.approx(sigmas, rel=0.15 if k == -1 else 0.6)
+
+
+@pytest.mark.parametrize("bearings", [True, False], ids=["range-bearing", "range-only"])
+def test_what_is_marginalised_is_neither_lost_nor_counted_twice(bearings: bool) -> None:
+    """A window of a quarter of the run ends with the same map and pose as one of the whole run, and the same sigmas."""
+    run = recorded(world(1), bearings=bearings)
+    long, short = (estimated(run, PLAIN, LAG.model_copy(update={"window_s": s})) for s in (1e4, 15.0))
+    found = [
+        (
+            np.array([*track.poses[-1], *(value for one in track.beacons.values() for value in one[:2])]),
+            np.concatenate([np.diag(P) for P in (track.covariances[-1], *(one[2] for one in track.beacons.values()))]),
+        )
+        for track in (long, short)
+    ]
+    (a, P), (b, Q) = found
+    assert np.all(np.abs(a - b) < 0.5 * np.sqrt(P))
+    assert np.sqrt(Q) == pytest.approx(np.sqrt(P), rel=0.15)
+
+
+def test_it_is_better_than_one_linearisation_for_each_reading() -> None:
+    run = trait_run((), 0)
+    once = judge(filter_run(run, CONFIG.csv, CONFIG.filter, no_clock), run)
+    again = judge(estimated(run, Settings(CONFIG.csv, CONFIG.filter), CONFIG.fixed_lag), run)
+    assert once.trajectory_rmse_m is not None
+    assert again.trajectory_rmse_m is not None
+    assert again.trajectory_rmse_m < 0.7 * once.trajectory_rmse_m
+
+
+def test_it_is_consistent_where_errors_last_and_says_that_they_do() -> None:
+    run = trait_run(("correlated",), 1)
+    track = estimated(run, Settings(CONFIG.csv, CONFIG.filter), CONFIG.fixed_lag)
+    found = judge(track, run).nees
+    assert found is not None
+    assert 0.3 < found.mean < 3.0
+    assert any("range errors of beacon" in line for line in track.warnings)
+
+
+def test_a_calibration_has_its_whole_prior_only_if_the_readings_want_it() -> None:
+    run = recorded(world(3, 90.0), bearings=False)
+    scaled = replace(run, readings=run.readings._replace(range_m=1.08 * run.readings.range_m))
+    given = Settings(CONFIG.csv, CONFIG.filter)
+    sure, free = (estimated(one, given, CONFIG.fixed_lag).calibration["range_scale"] for one in (run, scaled))
+    assert abs(sure.value) < 0.02
+    assert sure.sigma < 0.02
+    assert free.value == pytest.approx(0.08, abs=3.0 * free.sigma)
+
+
+# -- its parts --------------------------------------------------------------------------------------------------------
+
+
+def marginal() -> tuple[MarginalPrior, BatchState]:
+    rng = np.random.default_rng(3)
+    beacons, shared = rng.normal(0.0, 3.0, (2, BEACON)), 0.1 * rng.standard_normal(len(SHARED))
+    state = BatchState(np.array([[1.0, -2.0, 0.7]]), shared, beacons)
+    root = rng.standard_normal((3 + len(SHARED) + beacons.size,) * 2)
+    return MarginalPrior.made(state, 0, np.ones(2, dtype=bool), root @ root.T, rng.standard_normal(len(root))), state
+
+
+def moved(state: BatchState, x: FloatArray) -> BatchState:
+    return state.moved(x[None, :3], x[3:])
+
+
+def test_the_prior_of_a_window_has_the_gradient_of_its_cost() -> None:
+    prior, state = marginal()
+    x = 0.3 * np.random.default_rng(4).standard_normal(3 + len(SHARED) + 2 * BEACON)
+    at = moved(state, x)
+    _, side = prior.normal_equations(at)
+    for k in range(x.size):
+        step = np.zeros_like(x)
+        step[k] = 1e-6
+        slope = (prior.cost(moved(at, step)) - prior.cost(moved(at, -step))) / 2e-6
+        assert -side[k] == pytest.approx(slope, rel=1e-5, abs=1e-5)
+
+
+def test_a_rotation_of_the_whole_map_tells_the_prior_of_the_heading_alone() -> None:
+    prior, state = marginal()
+    cost_of_heading = []
+    for angle in (0.0, 0.4):
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array(((c, -s), (s, c)))
+        beacons = np.column_stack([state.beacons[:, :2] @ turn.T, state.beacons[:, 2:]])
+        pose = np.array([*(turn @ state.poses[0, :2]), state.poses[0, 2] + angle])
+        L, _ = prior.normal_equations(BatchState(pose[None, :], state.shared, beacons))
+        direction = np.zeros(len(L))
+        quarter = np.array(((0.0, -1.0), (1.0, 0.0)))
+        direction[:3] = *(quarter @ pose[:2]), 1.0
+        for k in range(2):
+            direction[3 + len(SHARED) + BEACON * k :][:2] = quarter @ beacons[k, :2]
+        cost_of_heading.append(float(direction @ L @ direction))
+    assert cost_of_heading[1] == pytest.approx(cost_of_heading[0])
+    assert cost_of_heading[0] == pytest.approx(prior.information[2, 2])
+
+
+def test_elimination_leaves_the_marginal_of_the_last_pose_and_the_rest() -> None:
+    made, state = problem()
+    system = made.normal_equations(state, np.ones(6))
+    information, side = eliminated(system)
+    factored = Factored(system)
+    poses, shared = factored.solution()
+    assert np.linalg.inv(information) == pytest.approx(factored.covariance_at(-1), rel=1e-6, abs=1e-12)
+    assert np.linalg.solve(information, side) == pytest.approx(np.concatenate([poses[-1], shared]), rel=1e-6)
+    for k, covariance in enumerate(factored.pose_covariances()):
+        assert factored.covariance_at(k)[:3, :3] == pytest.approx(covariance, rel=1e-6, abs=1e-12)
+
+
+def test_a_part_that_is_replaced_takes_the_rest_along_as_an_update_of_it_does() -> None:
+    rng = np.random.default_rng(6)
+    root = rng.standard_normal((6, 6))
+    x, P, columns = rng.standard_normal(6), root @ root.T, np.array((1, 4))
+    updated, replaced = EkfSlam(x, P), EkfSlam(x, P)
+    updated.update(columns, np.array(((1.0, 0.5), (0.0, 2.0))), np.array((0.3, -1.0)), np.array((0.2, 0.4)))
+    at = np.ix_(columns, columns)
+    replaced.replace(columns, updated.mean[columns], updated.covariance[at])
+    assert replaced.mean == pytest.approx(updated.mean)
+    assert replaced.covariance == pytest.approx(updated.covariance)
+
+
+@pytest.mark.parametrize(("phi", "expected"), [(0.0, 1.0), (0.8, 9.0), (0.95, 39.0)])
+def test_errors_that_last_are_counted_as_few(phi: float, expected: float) -> None:
+    """(1 + phi) / (1 - phi) readings of a first-order process count as one."""
+    rng, found = np.random.default_rng(7), []
+    for _ in range(20):
+        e = rng.standard_normal(2000)
+        for k in range(1, e.size):
+            e[k] = phi * e[k - 1] + np.sqrt(1.0 - phi * phi) * e[k]
+        found.append(readings_as_one(correlations(e)))
+    assert np.mean(found) == pytest.approx(expected, rel=0.25)
