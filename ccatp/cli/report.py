@@ -14,8 +14,12 @@ from ccatp.cli import common
 from ccatp.errors import ConfigError, ExitStatus, UsageError
 
 if TYPE_CHECKING:
+    from ccatp.cli.align_points import PointOptions
     from ccatp.config.models import Config
     from ccatp.core import Measured
+    from ccatp.mirror.foreign_points import Frame
+    from ccatp.mirror.mirror import Mirror
+    from ccatp.mirror.mirror_alignment import SurveyResult
     from ccatp.records.run_reader import Recording
     from ccatp.studies.replay import ReplayEvaluation
 
@@ -105,9 +109,33 @@ def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: s
     "ccatp align runs/tonight",
     "ccatp align runs/tonight --csv moves.csv --figure panels.png",
     "ccatp align runs/tonight --with runs/evening",
+    "ccatp align --points tracker.csv --mirror fyst-m1 --offset-mm 19.05 --sigma-um 15",
     "ccatp align runs/tonight --json --set align.point_floor_m=2e-6",
 )
-@click.argument("run_dir", type=common.PATH)
+@click.argument("run_dir", type=common.PATH, required=False)
+@click.option(
+    "--points",
+    type=_FILE,
+    metavar="FILE",
+    help="Points of another instrument instead of fixes: label, x, y, z, sx, sy, sz.",
+)
+@click.option(
+    "--frame",
+    type=click.Choice(["world", "mirror", "telescope", "own"]),
+    default="world",
+    help="Frame of --points; own: fitted to --references. Default: world.",
+)
+@click.option(
+    "--references", type=_FILE, metavar="FILE", help="World coordinates of labels in --points, for --frame own."
+)
+@click.option(
+    "--unit", type=click.Choice(["mm", "m", "um"]), help="Of --points, if its header does not say; mm otherwise."
+)
+@click.option("--offset-mm", type=float, default=0.0, help="Centre of the target over the surface, along the normal.")
+@click.option(
+    "--sigma-um", type=click.FloatRange(min=0.0, min_open=True), help="Of each coordinate, instead of the file's."
+)
+@common.key_option("--mirror", "run.mirror", metavar="NAME", help="Of --points without a run directory.")
 @click.option(
     "--with",
     "others",
@@ -121,7 +149,13 @@ def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: s
 @common.figure_option("Draw deviations and moves")
 @common.JSON_OPTION
 def align(
-    run_dir: Path,
+    run_dir: Path | None,
+    points: Path | None,
+    frame: "Frame",
+    references: Path | None,
+    unit: str | None,
+    offset_mm: float,
+    sigma_um: float | None,
     others: tuple[Path, ...],
     settings: Mapping[str, object],
     csv_file: Path | None,
@@ -131,8 +165,15 @@ def align(
     """Show the alignment of the panels and the moves of their adjusters, from the fixes of a run.
 
     The laser network is adjusted to all lengths of the run first, and the panels are computed
-    with it.
+    with it. With --points the points come from a file, and from no run.
     """
+    if points is not None:
+        from ccatp.cli.align_points import PointOptions
+
+        options = PointOptions(points, references, frame, unit, 1e-3 * offset_mm, sigma_um and 1e-6 * sigma_um)
+        return _align_points(run_dir, settings, options, csv_file, figure_file, json_output)
+    if run_dir is None:
+        raise UsageError("name the directory of a run, or --points FILE")
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.mirror_alignment import align_survey, compare
     from ccatp.records.run_reader import read_run
@@ -158,6 +199,52 @@ def align(
     }
     warnings = [*survey.warnings, *remarks(network), *result.warnings]
     common.warn(warnings)
+    _write_files(mirror, result, csv_file, figure_file, str(run_dir))
+    lines = [*table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m), *network_lines(network)]
+    data = {**facts, **result_data(result, comparison), "network": network_data(network), "warnings": warnings}
+    common.print_result(data, lines, json_output)
+    return 0
+
+
+def _align_points(
+    run_dir: Path | None,
+    settings: Mapping[str, object],
+    options: "PointOptions",
+    csv_file: Path | None,
+    figure_file: Path | None,
+    json_output: bool,
+) -> int:
+    from ccatp.cli.align_points import align_points
+    from ccatp.report.alignment import result_data, table_lines
+
+    _check_effect(settings, (*ALIGN_KEYS, "run.mirror"), "the alignment of points")
+    found = align_points(run_dir, settings, options)
+    measured = len(found.assigned.measured)
+    facts = {
+        "run_dir": str(options.points),
+        "mirror": found.mirror.name,
+        "world": None,
+        "seed": 0,
+        "points": {
+            "total": measured,
+            "measured": measured,
+            "outliers": sum(len(panel.outliers) for panel in found.result.panels),
+        },
+        "adjusters": list(found.result.panels[0].adjusters) if found.result.panels else [],
+        "puck_height_sigma_um": 0.0,
+    }
+    warnings = [*found.lines[1:], *found.result.warnings]
+    common.warn(warnings)
+    _write_files(found.mirror, found.result, csv_file, figure_file, str(options.points))
+    lines = [*table_lines(facts, found.result, None, 0.0), *found.lines]
+    data = {**facts, **result_data(found.result, None), "instrument": found.data, "warnings": warnings}
+    common.print_result(data, lines, json_output)
+    return 0
+
+
+def _write_files(
+    mirror: "Mirror", result: "SurveyResult", csv_file: Path | None, figure_file: Path | None, name: str
+) -> None:
     if csv_file is not None:
         from ccatp.report.tables import csv_lines, panel_table
 
@@ -165,11 +252,7 @@ def align(
     if figure_file is not None:
         from ccatp.report.mirror_map import draw_alignment
 
-        draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
-    lines = [*table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m), *network_lines(network)]
-    data = {**facts, **result_data(result, comparison), "network": network_data(network), "warnings": warnings}
-    common.print_result(data, lines, json_output)
-    return 0
+        draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", name)
 
 
 def _measured_with(run_dir: Path, cfg: "Config") -> "Sequence[Measured]":

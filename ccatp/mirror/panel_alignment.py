@@ -213,6 +213,8 @@ def adjuster_moves(fit: ModeFit, modes: Modes, places_m: FloatArray) -> Moves:
 _CURVATURES = 3
 # Number of redundant points required for each point left out. With fewer, some selection of points always fits.
 REDUNDANCY = 3
+# Points that are left out at most, and number of points from which it is one: the selections are tried one by one.
+_MOST_LEFT_OUT, _MANY = 2, 20
 
 
 class Prices(NamedTuple):
@@ -264,7 +266,7 @@ def explain(deviations: Deviations, price: Prices) -> tuple[Explanation, ...]:
         extra = price.shape if has_shape else 0.0
         whitened = modes(deviations.places_m) * (deviations.lever / deviations.sigmas_m)[:, None]
         whitened /= np.linalg.norm(whitened, axis=0)
-        for is_kept in _subsets(count, (count - needed) // REDUNDANCY):
+        for is_kept in _subsets(count, min((count - needed) // REDUNDANCY, _MOST_LEFT_OUT if count <= _MANY else 1)):
             cost = extra + price.outlier * int(np.count_nonzero(~is_kept))
             if cost >= lowest + UNDECIDED:
                 continue

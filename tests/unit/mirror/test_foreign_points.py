@@ -1,0 +1,276 @@
+"""Points of other instruments: how files are read, which frames, panels and sigmas they get, and what is refused."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccatp.cli import main
+from ccatp.core import DeckPose, FloatArray, PanelId
+from ccatp.mirror.foreign_points import PointsError, fit_frame, panel_of_label, world_from
+from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
+from ccatp.mirror.point_file import PointFileError, parse_points
+from tests.support.command import answered
+from tests.support.scenario import world_of
+
+CFG, M1 = world_of()
+PANELS = (PanelId(4, 5), PanelId(5, 4), PanelId(5, 8))
+LIES = PanelMisalignment(120e-6, -80e-6, 50e-6)
+OFFSET_M = 0.01905  # of a ball of 1.5 inches
+SIGMA_UM = 15.0
+
+
+def places(per_side: int = 3, noise_um: float = SIGMA_UM, offset_m: float = OFFSET_M, seed: int = 4) -> FloatArray:
+    """World coordinates of targets on the panels, mm, on a grid of ``per_side`` squared."""
+    rng, found = np.random.default_rng(seed), []
+    for panel in PANELS:
+        body = M1.panel(panel)
+        for y in np.linspace(-0.3, 0.3, per_side) + body.y_m:
+            for x in np.linspace(-0.28, 0.28, per_side) + body.x_m:
+                found.append(misaligned_puck_world(M1, panel, LIES, DeckPose(float(x), float(y), 0.0), offset_m))
+    return 1e3 * np.array(found) + 1e-3 * noise_um * rng.normal(size=(len(found), 3))
+
+
+def labels(per_side: int = 3) -> list[str]:
+    return [f"{panel.row}/{panel.col}/{k + 1}" for panel in PANELS for k in range(per_side**2)]
+
+
+def rows(places_mm: FloatArray, names: list[str]) -> list[str]:
+    return [f"{name},{x:.4f},{y:.4f},{z:.4f}" for name, (x, y, z) in zip(names, places_mm.tolist(), strict=True)]
+
+
+@pytest.fixture
+def aligned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """The JSON of the command on these lines."""
+
+    def run(lines: list[str], *args: str) -> Any:
+        (tmp_path / "points.csv").write_text("\n".join(lines), encoding="utf-8")
+        usual = () if "--sigma-um" in args else ("--sigma-um", str(SIGMA_UM))
+        offset = () if "--offset-mm" in args else ("--offset-mm", str(1e3 * OFFSET_M))
+        where = "--points", str(tmp_path / "points.csv"), "--mirror", "fyst-m1"
+        return answered(capsys, "align", *where, *usual, *offset, *args)
+
+    return run
+
+
+def is_recovered(found: Any, sigmas: float = 5.0) -> bool:
+    truth = np.array([LIES.piston_m, LIES.tip_rad, LIES.tilt_rad]) * 1e6
+    for panel in found["panels"]:
+        values = np.array([panel["piston_um"], panel["tip_urad"], panel["tilt_urad"]])
+        if np.max(np.abs(values - truth) / panel["sigma"]) > sigmas:
+            return False
+    return len(found["panels"]) == len(PANELS)
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+ONE = (-1.2345678, 0.001, 3600.5e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("A1\t-1234.5678\t1\t3600.5\t0.015\t0.015\t0.02", None),
+        ("A1\t-1.234,5678\t1,0\t3.600,5\t0,015\t0,015\t0,02", None),
+        ("A1;-1234,5678;1,0;3600,5;0,015;0,015;0,02", None),
+        ('"A1", -1234.5678, 1.0, 3600.5, 0.015, 0.015, 0.020', None),
+        ("A1\t-1,234.5678\t1.0\t3,600.5\t0.015\t0.015\t0.020", None),
+        ("A1 -1234.5678 1.0 3600.5 0.015 0.015 0.020", None),
+        ("# exported\nz [mm],sx,sy,sz,label,y [mm],x [mm]\n3600.5,0.015,0.015,0.02,A1,1.0,-1234.5678", None),
+        ("label,x_m,y_m,z_m,sx,sy,sz\nA1,-1.2345678,0.001,3.6005,1.5e-5,1.5e-5,2e-5", None),
+        ("A1 -1.2345678 0.001 3.6005 1.5e-5 1.5e-5 2e-5", "m"),
+    ],
+)
+def test_a_line_is_read_in_every_form(text: str, unit: str | None) -> None:
+    (one,) = parse_points(text, "f.csv", unit)
+    assert one.label == "A1"
+    assert one.place_m == pytest.approx(ONE, abs=1e-12)
+    assert one.sigmas_m == pytest.approx((15e-6, 15e-6, 20e-6))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "f.csv: no points in it"),
+        ("A1,1,2", "f.csv:1: 3 columns"),
+        ("A1,1,2,x3", "f.csv:1: z is 'x3', which is no number"),
+        ("A1,1,2,3\nA2,1,nan,3", "f.csv:2: y is 'nan', which is no number"),
+        ("A1,1,2,3,0,1,1", "f.csv:1: a sigma is not positive"),
+    ],
+)
+def test_a_file_that_is_none_is_refused_with_its_line(text: str, message: str) -> None:
+    with pytest.raises(PointFileError, match=message.replace("(", r"\(")):
+        parse_points(text, "f.csv")
+
+
+def test_labels_name_panels_as_ours_and_as_those_of_the_observatory() -> None:
+    assert panel_of_label("3/7/4", M1) == panel_of_label("3-7", M1) == PanelId(3, 7)
+    # Telescope, mirror, column, row, number.
+    assert panel_of_label("11731", M1) == panel_of_label("11731_T04", M1) == PanelId(3, 7)
+    assert panel_of_label("TARGET 9", M1) is None
+    with pytest.raises(PointsError, match="label 12281 is of mirror 2"):
+        panel_of_label("12281", M1)
+    with pytest.raises(PointsError, match="no panel in row 1, column 1"):
+        panel_of_label("11111", M1)
+    assert panel_of_label("12281", world_of("fyst-m2").mirror) == PanelId(8, 2)
+
+
+# -- frames -----------------------------------------------------------------------------------------------------------
+
+
+def test_frames_are_right_handed_and_the_mirrors_lie_where_the_manufacturer_says() -> None:
+    for frame in ("world", "mirror", "telescope"):
+        axes = world_from(frame, M1, np.eye(3)) - world_from(frame, M1, np.zeros((3, 3)))
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+    # The manufacturer's drawing has the origins of M1 and M2 at (-120, 0, -3600) and (-4920, 0, 0) mm.
+    found = world_from("telescope", M1, np.array([[-0.12, 0.0, -3.6], [-4.92, 0.0, 0.0]]))
+    assert found == pytest.approx(np.array([[0.0, 0.0, 3.6], [0.0, -4.8, 0.0]]), abs=1e-12)
+
+
+def turned(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    a, b = 0.7, -0.4
+    first = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
+    second = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(b), -np.sin(b)], [0.0, np.sin(b), np.cos(b)]])
+    rotation, shift = second @ first, np.array([2.0, -1.0, 0.5])
+    return (points - shift) @ rotation, rotation, shift
+
+
+def test_the_frame_of_an_instrument_is_fitted_with_its_covariance() -> None:
+    world = np.random.default_rng(2).uniform(-3.0, 3.0, size=(8, 3))
+    own, rotation, shift = turned(world)
+    exact = fit_frame(own, world)
+    assert exact.rotation == pytest.approx(rotation, abs=1e-12)
+    assert exact.shift_m == pytest.approx(shift, abs=1e-12)
+    rng, pulls = np.random.default_rng(3), []
+    for _ in range(200):
+        fitted = fit_frame(own, world + 20e-6 * rng.normal(size=world.shape))
+        error = fitted.rotation @ (rotation.T) - np.eye(3)
+        vector = np.array([error[2, 1], error[0, 2], error[1, 0]])
+        pulls.append(vector @ np.linalg.solve(fitted.covariance[:3, :3], vector))
+    # Three degrees of freedom with an estimated variance of 18: mean 3 x 18 / 16; four sigmas.
+    assert np.mean(pulls) == pytest.approx(3.4, abs=0.8)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda own: own * [1.0, -1.0, 1.0], "left-handed"),
+        (lambda own: own[:2], "2 reference points"),
+        (lambda own: np.outer(np.arange(8.0), [1.0, 2.0, 3.0]), "lie on one line"),
+    ],
+)
+def test_references_that_give_no_frame_are_refused(change: Callable[[FloatArray], FloatArray], message: str) -> None:
+    world = np.random.default_rng(2).uniform(-3.0, 3.0, size=(8, 3))
+    own = change(turned(world)[0])
+    with pytest.raises(PointsError, match=message):
+        fit_frame(own, world[: len(own)])
+
+
+# -- panels -----------------------------------------------------------------------------------------------------------
+
+
+def test_points_of_a_tracker_give_the_panels_by_label_and_by_position(aligned: Callable[..., Any]) -> None:
+    points = places()
+    by_label = aligned(rows(points, labels()))
+    assert is_recovered(by_label)
+    assert by_label["points"]["measured"] == 27
+    by_place = aligned(rows(points, [f"T{k}" for k in range(27)]))
+    assert by_place["panels"] == by_label["panels"]
+
+
+@pytest.mark.parametrize("per_side", [2, 5])
+def test_more_and_fewer_than_nine_points_of_a_panel(aligned: Callable[..., Any], per_side: int) -> None:
+    assert is_recovered(aligned(rows(places(per_side), labels(per_side))))
+
+
+@pytest.mark.parametrize("frame", ["mirror", "telescope"])
+def test_coordinates_of_another_frame(aligned: Callable[..., Any], frame: str) -> None:
+    zero, axes = world_from(frame, M1, np.zeros((1, 3))), world_from(frame, M1, np.eye(3))  # type: ignore[arg-type]
+    there = 1e3 * (places() / 1e3 - zero) @ np.linalg.inv(axes - zero)
+    assert is_recovered(aligned(rows(there, labels()), "--frame", frame))
+
+
+def test_the_own_frame_of_a_tracker_with_references(aligned: Callable[..., Any], tmp_path: Path) -> None:
+    known = np.random.default_rng(5).uniform(-3000.0, 3000.0, size=(6, 3))
+    (tmp_path / "references.csv").write_text("\n".join(rows(known, [f"R{k}" for k in range(6)])), encoding="utf-8")
+    measured = known + 0.02 * np.random.default_rng(6).normal(size=known.shape)
+    own = 1e3 * turned(np.vstack([places(), measured]) / 1e3)[0]
+    found = aligned(
+        rows(own, [*labels(), *(f"R{k}" for k in range(6))]),
+        "--frame", "own", "--references", str(tmp_path / "references.csv"),
+    )  # fmt: skip
+    assert is_recovered(found)
+    # The frame adds to the standard deviation of the piston, 15 um / 3.
+    assert all(panel["sigma"][0] > 6.0 for panel in found["panels"])
+    assert len(found["instrument"]["reference_residuals_um"]) == 6
+
+
+def test_repeated_readings_that_scatter_more_than_claimed_scale_the_sigmas(aligned: Callable[..., Any]) -> None:
+    twice = [places(noise_um=40.0, seed=seed) for seed in (1, 2, 3)]
+    found = aligned([line for one in twice for line in rows(one, labels())])
+    assert found["instrument"]["repeated"] == 54
+    assert found["instrument"]["repeat_sigma_um"] == pytest.approx(40.0, rel=0.3)
+    assert found["instrument"]["sigma_factor"] == pytest.approx(40.0 / SIGMA_UM, rel=0.35)
+    assert is_recovered(found, 4.0)
+    assert any("standard deviations are multiplied by" in line for line in found["warnings"])
+
+
+def test_good_readings_keep_their_sigmas(aligned: Callable[..., Any]) -> None:
+    found = aligned(rows(places(noise_um=10.0), labels()))
+    assert found["instrument"]["sigma_factor"] == 1.0
+
+
+# -- what is refused --------------------------------------------------------------------------------------------------
+
+
+def mixed(lines: list[str]) -> list[str]:
+    name, *numbers = lines[4].split(",")
+    return [*lines[:4], ",".join([name, *(str(float(one) / 1e3) for one in numbers)]), *lines[5:]]
+
+
+def swapped(lines: list[str]) -> list[str]:
+    return [f"{name},{y},{x},{z}" for name, x, y, z in (line.split(",") for line in lines)]
+
+
+def mirrored(lines: list[str]) -> list[str]:
+    return [",".join((name, str(-float(x)), y, z)) for name, x, y, z in (line.split(",") for line in lines)]
+
+
+def one_name(lines: list[str]) -> list[str]:
+    return [line.replace("5/4/", "4/5/") for line in lines]
+
+
+REFUSED: dict[str, tuple[Callable[[list[str]], list[str]], tuple[str, ...], str]] = {
+    "mixed units": (mixed, (), "in metres, mixed units; 1 of 27 points"),
+    "all in metres": (lambda lines: lines, ("--unit", "um"), "is not on fyst-m1"),
+    "swapped axes": (swapped, (), "with (y, x, z) in place of (x, y, z) the points lie on it"),
+    "left-handed": (mirrored, (), "names panel 5/4, and lies on 5/6, as 18 of 27 points do: a left-handed frame"),
+    "two panels with one name": (one_name, (), "names panel 4/5, and lies on 5/4"),
+    "offset of the wrong sign": (lambda lines: lines, ("--offset-mm", "-19.05"), "seems to have the wrong sign"),
+    "no sigma": (lambda lines: lines, ("--sigma-um", ""), "no sigma; add columns sx, sy, sz, or give --sigma-um"),
+}
+
+
+@pytest.mark.parametrize(("change", "args", "message"), REFUSED.values(), ids=[*REFUSED])
+def test_points_that_cannot_be_are_refused_in_one_line(
+    change: Callable[[list[str]], list[str]], args: tuple[str, ...], message: str,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    file = tmp_path / "points.csv"
+    file.write_text("\n".join(change(rows(places(), labels()))), encoding="utf-8")
+    usual = {"--sigma-um": "15", "--offset-mm": "19.05"} | dict(zip(args[::2], args[1::2], strict=True))
+    options = [part for pair in usual.items() if pair[1] for part in pair]
+    assert main(["align", "--points", str(file), "--mirror", "fyst-m1", *options]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    (line,) = err.splitlines()
+    assert message in line
+
+
+def test_collinear_points_determine_no_panel(aligned: Callable[..., Any]) -> None:
+    lines = rows(places(), labels())
+    found = aligned([line for k, line in enumerate(lines) if k > 8 or k < 3])
+    assert len(found["panels"]) == 2
+    assert [one["why"] for one in found["undetermined"]] == ["its points lie on one line"]
