@@ -18,7 +18,7 @@ import zmq
 
 from ccatp.links.bus import Subscriber
 from ccatp.links.topics import Timing
-from tests.processes.test_observers import WITH_PAGE, open_page, page_port
+from tests.support.dashboards import WITH_PAGE, open_page, page_port
 from tests.support.runs import NO_CALIBRATION, Run
 
 PAGES = (0, 1, 3, 50)

@@ -10,7 +10,6 @@ import json
 import math
 import multiprocessing
 import random
-import shutil
 import socket
 import sys
 import tempfile
@@ -33,13 +32,9 @@ from ccatp.daemon.supervision.process import Endpoints, RunContext
 from ccatp.links.bus import Publisher
 from ccatp.links.topics import FixMessage, Heartbeat, TrackMessage, TruthMessage
 from ccatp.report.dashboard.access import make_token
-from tests.contract.page_rig import mission, picture
+from tests.support.browser import CHROMIUM, FLAGS
+from tests.support.page_rig import mission, picture
 
-CHROMIUM = shutil.which("chromium")
-FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update",
-    "--disable-sync", "--no-first-run", "--disable-dev-shm-usage", "--disable-extensions",
-)  # fmt: skip
 CFG = load_config(None, {"dashboard.max_connections": 256})
 FRAMES, SPEED_M_S, RADIUS_M = 100, 0.1, 0.15  # frames a second; the robot drives in circles on a panel
 MESSAGE_EVERY_S, FIX_EVERY_S, MOMENTS = 2, 4, 10

@@ -1,10 +1,13 @@
-"""Makes pictures of the documentation in Chromium: ``python -m tools.screenshots``.
+"""Makes pictures in Chromium: ``python -m tools.screenshots``.
 
-``dashboard [FOLDER]``: the page of simulated runs of their own: waiting for the laser system, driving, the same on a
-phone, held with three alarms, and done. A picture that is larger than ``MAX_BYTES`` is an error.
-``report RUN_DIR``: parts of a report.
+``dashboard [FOLDER]``: those of the documentation, of simulated runs of their own: waiting for the laser system,
+driving, the same on a phone, held with three alarms, and done. A picture larger than ``MAX_BYTES`` is an error.
+``states [FOLDER] [NAME]...``: every state of a mission before the page of a played daemon (``tools.page_states``), on a
+desktop and a phone, light and dark; without a folder in ``build/screenshots``.
+``report RUN_DIR``: parts of a report, for the documentation.
 """
 
+import asyncio
 import shutil
 import sys
 import tempfile
@@ -18,10 +21,11 @@ from PIL import Image
 from playwright.sync_api import Page, expect, sync_playwright
 
 from ccatp.report.run_page import report_run
-from tests.processes.test_observers import WITH_PAGE, page_port
-from tests.processes.test_page import browser_page
+from tests.support.browser import browser_page
+from tests.support.dashboards import WITH_PAGE, page_port
 from tests.support.runs import NO_CALIBRATION, Run
-from tools.generated_docs import DOCS
+from tools.generated_docs import DOCS, ROOT
+from tools.page_states import picture_states
 
 DESKTOP, PHONE = (1440, 900), (390, 844)
 MAX_BYTES = 200_000
@@ -138,6 +142,9 @@ def main(kind: str, *names: str) -> None:
     places = [Path(name) for name in names]
     if kind == "report":
         picture_report(*places)
+    elif kind == "states":
+        folder, *chosen = names or (str(ROOT / "build" / "screenshots"),)
+        asyncio.run(picture_states(Path(folder), chosen))
     else:
         picture_dashboard(*places or [DOCS])
 

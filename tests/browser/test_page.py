@@ -19,7 +19,7 @@ from ccatp.config.load import load_config
 from ccatp.core import Cause
 from ccatp.links.topics import Alarm, FixMessage, TrackMessage, Turn
 from ccatp.report.dashboard.history import Growing
-from tests.contract.page_rig import Rig, page_rig
+from tests.support.page_rig import Rig, page_rig
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page is not tried in a browser")
@@ -165,7 +165,7 @@ async def test_the_line_says_whose_turn_it_is_and_has_the_one_button_that_is_acc
     await operator.until("document.querySelector('#resume').disabled", True)
     await operator.until("/^status \\d\\.\\d s old$/.test(document.querySelector('#age').textContent)", True)
     operator.rig.stop.set()  # the dashboard ends; the survey may go on
-    await operator.page.wait_for_function("document.querySelector('#age').textContent.startsWith('no daemon answers')")
+    await expect(operator.page.locator("#age")).to_contain_text("no daemon answers")
 
 
 async def test_after_the_end_alarms_stay_and_nothing_is_offered(operator: Operator) -> None:

@@ -23,7 +23,7 @@ from ccatp.config.models import Config
 from ccatp.daemon.supervision.process import open_log
 from ccatp.links.channels import format_error, format_ok
 from ccatp.report.dashboard.app import build_app
-from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
+from tests.support.page_rig import DEADLINE_S, Rig, mission, page_rig
 from tests.unit.report.dashboard.test_view import parse
 
 FILES = (

@@ -33,18 +33,13 @@ from ccatp.records.recorder import iter_messages
 from ccatp.studies.sil_run import rehearse
 from tests.docs.test_docs import blocks
 from tests.processes.conftest import Start
+from tests.support.dashboards import WITH_PAGE, open_page, page_port
 from tests.support.examples import is_like
 from tests.support.runs import NO_CALIBRATION, NO_REPORT, Run
 from tools.generated_docs import DOCS, ROOT
 
-WITH_PAGE = ("--set", "dashboard.enabled=true", "--set", "dashboard.port=0")
 URL = re.compile(r"http://127\.0\.0\.1:(\d+)/")
 DEADLINE_S = 30.0
-
-
-def page_port(run: Run) -> int:
-    """Of a run that has begun."""
-    return load_config(run.run_dir / "config.toml").dashboard.port
 
 
 def ask(port: int, method: str, path: str) -> tuple[int, Any]:
@@ -66,17 +61,6 @@ def mission_of(port: int) -> dict[str, Any]:
         if mission is not None:
             return mission
     raise AssertionError("the dashboard receives nothing")
-
-
-@contextmanager
-def open_page(port: int) -> Iterator[socket.socket]:
-    """A page that has received something."""
-    with socket.create_connection(("127.0.0.1", port), timeout=DEADLINE_S) as page:
-        page.sendall(f"GET /events HTTP/1.1\r\nhost: 127.0.0.1:{port}\r\n\r\n".encode())
-        received = b""
-        while b"event: news" not in received:
-            received += page.recv(65_536)
-        yield page
 
 
 # -- runs of their own ------------------------------------------------------------------------------------------------

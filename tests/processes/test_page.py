@@ -5,49 +5,28 @@ import json
 import re
 import socket
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Page, expect
 
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.config.package import configs_dir
 from ccatp.report.dashboard.view import MAX_LINES, MAX_SAMPLES
 from tests.processes.conftest import Start
-from tests.processes.test_observers import WITH_PAGE, ask, open_page, page_port
+from tests.processes.test_observers import ask
 from tests.processes.test_replay import BeaconRun
+from tests.support.browser import CHROMIUM, PATIENCE_MS, browser_page
+from tests.support.dashboards import WITH_PAGE, open_page, page_port
 from tests.support.runs import Run
-from tools.page_load import CHROMIUM, FLAGS, MESSAGE_EVERY_S, load
+from tools.page_load import MESSAGE_EVERY_S, load
 
-PATIENCE_MS = 30_000
 expect.set_options(timeout=PATIENCE_MS)  # on two busy cores a robot may be held for want of frames, and go on
 PHONE = {"width": 360, "height": 740}
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page is not tried in a browser")
-
-
-@contextmanager
-def browser_page(port: int, runtime_dir: Path) -> Iterator[Page]:
-    """The page at a port in a browser, with its token; it asks nowhere else, and nothing fails in it."""
-    asked: set[str] = set()
-    errors: list[str] = []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
-        try:
-            page = browser.new_page(viewport={"width": 1280, "height": 900})
-            page.set_default_timeout(PATIENCE_MS)
-            page.on("request", lambda request: asked.add(urlsplit(request.url).netloc))
-            page.on("pageerror", lambda error: errors.append(str(error)))
-            page.goto(f"http://127.0.0.1:{port}/?token={(runtime_dir / 'dashboard.token').read_text().strip()}")
-            yield page
-        finally:
-            browser.close()
-    assert asked == {f"127.0.0.1:{port}"}, "asked elsewhere"
-    assert errors == []
 
 
 def test_an_operator_looks_and_aborts(start: Start) -> None:
@@ -61,7 +40,8 @@ def test_an_operator_looks_and_aborts(start: Start) -> None:
         sees_a_dead_main_loop(page, run)
         aborts_in_two_steps(page)
         assert run.wait() == 3, run.stderr
-        expect(page.locator("#ended")).to_contain_text("The daemon has ended: aborted, at base")
+        expect(page.locator("#ended")).to_contain_text("The daemon ended at")
+        expect(page.locator("#state")).to_contain_text("returned to base; by operator")
         expect(page.locator("#alarm")).to_be_hidden()
         expect(page.locator("#abort")).to_be_disabled()
 
@@ -70,7 +50,8 @@ def sees_a_running_survey(page: Page) -> None:
     expect(page.locator("#simulation")).to_be_visible()
     expect(page.locator("#total")).to_have_text("81")
     expect(page.locator("#state")).to_have_attribute("data-level", "good")
-    expect(page.locator("#verdict")).to_contain_text("0 normal operation")
+    expect(page.locator("#next")).to_contain_text("the robot continues by itself")
+    expect(page.locator("#code")).to_contain_text("0 normal operation")
     expect(page.locator("#links li[data-well=yes]")).to_have_count(4)
     expect(page.locator("#pose-xy")).to_contain_text(" m")
     expect(page.locator("#map")).to_have_attribute("aria-label", re.compile(r"Map: robot at .* m, \d+ of 81 points"))
@@ -131,7 +112,8 @@ def knows_keys(page: Page) -> None:
     expect(page.locator("#pause")).to_be_enabled()  # not while the page waits for news of a busy machine
     page.keyboard.press("p")
     expect(page.locator("#answer")).to_have_text("pause: done")
-    expect(page.locator("#state")).to_contain_text("held")
+    expect(page.locator("#state")).to_have_text("paused by operator")
+    expect(page.locator("#act")).to_have_text("Resume")
     page.keyboard.press("r")
     expect(page.locator("#answer")).to_have_text("resume: done")
     page.keyboard.press("a")
@@ -167,7 +149,7 @@ def aborts_in_two_steps(page: Page) -> None:
     expect(button).to_be_enabled()
     button.dblclick()  # one wish, not two
     expect(button).to_have_text("Confirm?")
-    expect(page.locator("#state")).not_to_contain_text("returning")
+    expect(page.locator("#state")).not_to_contain_text("driving home")
     page.wait_for_timeout(500)  # longer than a double click
     button.click()
     expect(page.locator("#answer")).to_have_text("abort: done")
@@ -185,10 +167,11 @@ def test_an_operator_looks_aborts_and_stops_among_beacons(tmp_path: Path, runtim
             fits_a_phone(page)
             assert ask(port, "GET", "/healthz")[0] == 200
             aborts_in_two_steps(page)
-            expect(page.locator("#state")).to_contain_text("returning")
+            expect(page.locator("#state")).to_contain_text("driving home, called by operator")
             page.locator("#stop").click()
             assert run.wait() == 4, run.stderr
-            expect(page.locator("#ended")).to_contain_text("The daemon has ended: stopped")
+            expect(page.locator("#ended")).to_contain_text("The daemon ended at")
+            expect(page.locator("#state")).to_contain_text("stopped where it was; by operator")
             expect(page.locator("#ended")).to_contain_text(re.compile(r"\d+ of 200 waypoints reached"))
         assert json.loads(run.stdout)["outcome"] == "stopped"
         assert f"report  {run.run_dir / 'report.html'}" in run.stderr
@@ -201,7 +184,7 @@ def sees_a_mission_among_beacons(page: Page) -> None:
         "#total": "200",
         "#unit": "waypoints",
         "#state": "visiting",
-        "#verdict": "0 normal operation",
+        "#code": "0 normal operation",
         "#pose-xy": " m",
         "#facts": "beacons on the map4",
     }.items():

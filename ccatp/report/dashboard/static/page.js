@@ -206,7 +206,7 @@ function showTurn(state) {
   $("state").classList.toggle("stale", mission.is_stale);
   text("next", then ? `Next: ${who} ${then}`.replace(/ +/g, " ") : "");
   $("turn").dataset.actor = mission.turn.actor;
-  $("act").hidden = is_over || !request || !commands.token;
+  $("act").hidden = is_over || !request || !commands.token || state.losses.length > 0;
   text("act", { resume: "Resume", clear: "Clear …" }[request] ?? "");
   $("act").onclick = () => (request === "clear" ? alarms.clearFirst() : commands.press(request));
 }

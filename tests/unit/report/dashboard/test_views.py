@@ -35,7 +35,7 @@ from ccatp.report.dashboard.history import replay
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.survey_view import ground as survey_ground
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
-from tests.contract.page_rig import mission, picture
+from tests.support.page_rig import mission, picture
 from tests.support.scenario import config_of, mirror_of
 
 LINE = (
