@@ -22,7 +22,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 # One more than there are cores: tests of real processes wait for most of their time.
 PYTEST := $(BIN)/python -m pytest -n $$(($(WORKERS) + 1)) --dist loadgroup --no-loadscope-reorder
 
-.PHONY: help run test tests test-newest newest run-newest strict-run environment test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
+.PHONY: help run test tests test-newest newest run-newest strict-run environment test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel beacon-onboard-wheel metrics lint format
 .PHONY: kills mutants golden golden-quick lock audit look clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
@@ -40,6 +40,7 @@ help:
 	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
 	@echo "make man            the manual page, build/man/ccatp.1"
 	@echo "make onboard-wheel    the small package for the robot's own computer, build/ccatp_onboard-*.whl"
+	@echo "make beacon-onboard-wheel  the same for a robot among beacons, build/ccatp_beacon_onboard-*.whl"
 	@echo "make golden           this tree against a base commit, both run here, bit for bit; make golden-quick: a few cases"
 	@echo "make metrics          size of the code base, calls and files per frame; ARGS=--names lists them"
 	@echo "make lint             lint, types, import contract"
@@ -147,6 +148,11 @@ onboard-wheel: $(VENV)/.installed-dev
 	@mkdir -p build
 	@$(PIP) wheel --no-deps --no-build-isolation --wheel-dir build packaging/onboard
 	@echo "ccatp: $$(ls -t build/ccatp_onboard-*.whl | head -n 1)"
+
+beacon-onboard-wheel: $(VENV)/.installed-dev
+	@mkdir -p build
+	@$(PIP) wheel --no-deps --no-build-isolation --wheel-dir build packaging/beacon_onboard
+	@echo "ccatp: $$(ls -t build/ccatp_beacon_onboard-*.whl | head -n 1)"
 
 metrics: $(VENV)/.installed-dev
 	@$(BIN)/python -m tools.metrics $(ARGS)

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from functools import reduce
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.shell_completion import CompletionItem
@@ -32,9 +32,11 @@ PATIENCE_S = 2.0
 
 
 PATH = click.Path(path_type=Path)
+# The oldest click that is supported, which computers of robots may have, has no generic types.
+_FloatType = click.ParamType[float] if TYPE_CHECKING else click.ParamType
 
 
-class WaitingTime(click.ParamType[float]):
+class WaitingTime(_FloatType):
     """Time to wait, s: more than 0 and at most a day."""
 
     name = "seconds"

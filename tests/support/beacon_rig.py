@@ -58,9 +58,11 @@ def onboard_config(cfg: RadioConfig, **overrides: Any) -> BeaconOnboardConfig:
 class BeaconRig:
     """All fakes in the world of a configuration, and the devices of the program on them."""
 
-    def __init__(self, cfg: RadioConfig, onboard: BeaconOnboardConfig | None = None) -> None:
+    def __init__(
+        self, cfg: RadioConfig, onboard: BeaconOnboardConfig | None = None, time: FakeTime | None = None
+    ) -> None:
         self.cfg, self.onboard = cfg, onboard_config(cfg) if onboard is None else onboard
-        self.time = FakeTime(0.0)
+        self.time = FakeTime(0.0) if time is None else time
         self.world = RadioWorld(cfg)
         self.motes = motes_of(cfg)
         self._listener = None if self.motes is None else listener_of(cfg, self.motes)

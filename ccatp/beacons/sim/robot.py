@@ -128,7 +128,7 @@ class BeaconRobot(SimulatedBeaconRobot):
             motes = [] if self._listener is None else self._listener.receive(t_s, self.world.pose)
             extras = replace(frame.extras, steer=steer, motes=motes)
         line = RobotFrame(
-            self.seq, t_s, imu=(), enc=wheels, edge=(), gravity=None, fans=(0.0, 0.0), soc=1.0, cmd=cmd, faults=()
+            self.seq, t_s, imu=(), enc=wheels, edge=(), gravity=None, fans=self.fans.duty, soc=1.0, cmd=cmd, faults=()
         )
         self._line = with_extras(encode(line), extras)
 

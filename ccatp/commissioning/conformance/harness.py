@@ -16,13 +16,20 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ccatp.config.messages import format_key
-from ccatp.config.robot_limits import FrameRate, TimeToLive, WheelBase, WheelRadius, top_speed_problem
+from ccatp.config.robot_limits import (
+    FRAME_HZ,
+    VEHICLE_FRAME_HZ,
+    TimeToLive,
+    WheelBase,
+    WheelRadius,
+    top_speed_problem,
+)
 from ccatp.core import ALL_MOTION, Permits
 from ccatp.links.robot_codec import LineBuffer, encode, format_drive, format_permit, join_mac
 from ccatp.links.robot_messages import AUTH_HMAC, Fans, Join, Role
 from ccatp.mirror.mirror import Mirror
 
-Need = Literal["motion", "body", "real time", "lockstep", "hmac"]
+Need = Literal["motion", "body", "turn", "real time", "lockstep", "hmac"]
 Key = Literal["drive", "permit"]
 Ending = Literal["FIN", "RST"]
 Message = dict[str, Any]
@@ -107,15 +114,25 @@ def parse(model: type[PartT], message: Message, where: str = "") -> PartT:
         name = format_key(first["loc"])
         seen = f"no {name}" if first["type"] == "missing" else f"{name} = {first['input']!r}"
         own = first.get("ctx", {}).get("error")
-        raise CheckFailed(where + (seen if own is None else f"{name}: {own}")) from None
+        raise CheckFailed(where + (seen if own is None else f"{name}: {own}" if name else f"{own}")) from None
 
 
 class Timing(Part):
-    """Clock of the robot, in its hello."""
+    """Clock of the robot, in its hello; a robot with a vehicle may send fewer frames."""
 
     lockstep: bool
-    frame_hz: FrameRate
+    frame_hz: Positive
     ttl_s: TimeToLive
+    robot: Any = None
+
+    @model_validator(mode="after")
+    def _check_rate(self) -> Self:
+        robot = self.robot
+        vehicle = robot.get("vehicle") if isinstance(robot, dict) else getattr(robot, "vehicle", None)
+        limits = FRAME_HZ if vehicle is None else VEHICLE_FRAME_HZ
+        if problem := limits.problem("frame_hz", self.frame_hz, " Hz"):
+            raise ValueError(problem)
+        return self
 
     @property
     def frame_s(self) -> float:
@@ -130,6 +147,12 @@ class Body(Part):
     wheel_base_m: WheelBase
     max_wheel_rad_s: Positive
     fan_floor: float
+    vehicle: Any = None  # of a robot on a floor
+
+    @property
+    def is_steered(self) -> bool:
+        """Whether a steered wheel turns it: its wheels have one speed."""
+        return isinstance(self.vehicle, dict) and self.vehicle.get("kind") == "ackermann"
 
     @model_validator(mode="after")
     def _check_speed(self) -> Self:

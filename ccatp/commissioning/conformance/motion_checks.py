@@ -14,6 +14,7 @@ from ccatp.commissioning.conformance.harness import (
     Facts,
     Frame,
     Key,
+    Need,
     NotApplicable,
     Pair,
     require,
@@ -222,10 +223,11 @@ def _denied_again(pair: ControllerAndMonitor, denied: Permits) -> list[Frame]:
 
 
 for _check_id, _promise, _shares, _allowed, _denied in DIRECTIONS:
-    check_at_rest(_check_id, _promise, "motion")(partial(_direction, _shares, _allowed, _denied))
+    _needs: tuple[Need, ...] = ("motion",) if _shares[0] == _shares[1] else ("motion", "turn")
+    check_at_rest(_check_id, _promise, *_needs)(partial(_direction, _shares, _allowed, _denied))
 
 
-@check_at_rest("wheels-stop", "a drive of zero stops the wheels at once", "motion")
+@check_at_rest("wheels-stop", "a drive of zero stops the wheels at once", "motion", "turn")
 def _stops_at_zero(pair: ControllerAndMonitor) -> str:
     rate_rad_s = _rate(pair.facts)
     seen = ""
@@ -261,7 +263,7 @@ for _check_id, _promise, _key, _lost in STOPS:
     check_at_rest(_check_id, _promise, "motion", "real time")(partial(_stops, _key, _lost))
 
 
-@check_at_rest("move-clamp", "set points beyond max_wheel_rad_s are clamped, their ratio kept", "motion")
+@check_at_rest("move-clamp", "set points beyond max_wheel_rad_s are clamped, their ratio kept", "motion", "turn")
 def _clamp(pair: ControllerAndMonitor) -> str:
     most_rad_s = pair.facts.robot.max_wheel_rad_s
     seen = ""
@@ -276,7 +278,9 @@ def _clamp(pair: ControllerAndMonitor) -> str:
     return seen
 
 
-@check_at_rest("gyroscope", "wz is the angular rate about robot z in rad/s, left turns positive", "motion", "body")
+@check_at_rest(
+    "gyroscope", "wz is the angular rate about robot z in rad/s, left turns positive", "motion", "body", "turn"
+)
 def _gyroscope(pair: ControllerAndMonitor) -> str:
     """A turn in place and back; the bias cancels in the difference."""
     rate_rad_s, robot = _rate(pair.facts), pair.facts.robot

@@ -16,6 +16,7 @@ _HELLO_CHECKS = ("hello", "hello-robot")
 _WHY: dict[harness.Need, str] = {
     "motion": "--no-motion",
     "body": "--on-stands",
+    "turn": "a steered vehicle has one wheel speed",
     "real time": "lockstep: time stands still while an answer is missing",
     "lockstep": "hello.lockstep is false",
     "hmac": "hello.auth is none",
@@ -86,7 +87,8 @@ class Conformance:
         if (facts := self.facts) is not None:
             self._begin()
             has: dict[harness.Need, bool] = {
-                "motion": motion, "body": not on_stands, "real time": not facts.lockstep, "lockstep": facts.lockstep,
+                "motion": motion, "body": not on_stands,
+                "turn": not facts.robot.is_steered, "real time": not facts.lockstep, "lockstep": facts.lockstep,
                 "hmac": facts.needs_mac,
             }  # fmt: skip
             self._lacking = [need for need, is_there in has.items() if not is_there]

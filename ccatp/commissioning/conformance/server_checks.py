@@ -23,6 +23,7 @@ from ccatp.commissioning.conformance.harness import (
     Message,
     NotApplicable,
     Part,
+    Positive,
     RawConnection,
     Three,
     Timing,
@@ -75,7 +76,15 @@ class _HelloPart(Timing):
     auth: Literal["none", "hmac-sha256"]
 
 
+class _VehiclePart(Part):
+    kind: Literal["ackermann", "differential"]
+    axle_distance_m: Positive
+    steer_max_rad: Annotated[float, Field(ge=0.0, le=1.6)]
+    distance_sensors_rad: list[Annotated[float, Field(ge=-6.3, le=6.3)]]
+
+
 class _RobotPart(Body):
+    vehicle: _VehiclePart | None = None
     fan_floor: Fraction
     puck_m: Annotated[list[Near], Field(min_length=3, max_length=3)]
     edge_sensors_m: Annotated[list[Annotated[list[Near], Field(min_length=2, max_length=2)]],
@@ -93,14 +102,17 @@ def _hello(context: CheckContext) -> str:
     return f"{found.protocol}, auth {found.auth}, {found.frame_hz:g} Hz, ttl {found.ttl_s:g} s"
 
 
-@check("hello-robot", "hello.robot describes wheels, edge sensors in their order, puck, limit and fan floor")
+@check("hello-robot", "hello.robot describes wheels, edge sensors in their order or the vehicle, limit and fan floor")
 def _hello_robot(context: CheckContext) -> str:
     robot = parse(_HelloRobot, context.greet()[1]).robot
+    wheels = f"wheels {robot.wheel_radius_m:g} m on {robot.wheel_base_m:g} m"
+    if (vehicle := robot.vehicle) is not None:  # it drives on a floor, which has no edge
+        return f"{wheels}, {vehicle.kind}, {len(vehicle.distance_sensors_rad)} distance sensors"
     front_left, front_right, rear_left, rear_right = edges = robot.edge_sensors_m
     fore = min(front_left[0], front_right[0]) > max(rear_left[0], rear_right[0])
     aside = min(front_left[1], rear_left[1]) > max(front_right[1], rear_right[1])
     require(fore and aside, f"edge_sensors_m not in the order front-left, front-right, rear-left, rear-right: {edges}")
-    return f"wheels {robot.wheel_radius_m:g} m on {robot.wheel_base_m:g} m, fan floor {robot.fan_floor:g}"
+    return f"{wheels}, fan floor {robot.fan_floor:g}"
 
 
 @check("nonce", "each connection has a nonce of its own")
