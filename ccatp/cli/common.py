@@ -33,7 +33,10 @@ PATIENCE_S = 2.0
 
 PATH = click.Path(path_type=Path)
 # The oldest click that is supported, which computers of robots may have, has no generic types.
-_FloatType = click.ParamType[float] if TYPE_CHECKING else click.ParamType
+if TYPE_CHECKING:
+    _FloatType = click.ParamType[float]
+else:
+    _FloatType = click.ParamType
 
 
 class WaitingTime(_FloatType):

@@ -6,11 +6,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import hypot, sqrt
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from ccatp.beacons.analysis import open_beacons
 from ccatp.commissioning.conformance.runner import Conformance
 from tests.support.beacon_rig import PIONEER
 from tests.support.runs import NO_REPORT
@@ -74,6 +76,11 @@ def test_missions_of_the_processes_through_the_drivers(
         assert process.stdout is not None
         truth = {row[0]: row[2:4] for row in json.loads(process.stdout.read())}
     assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
-    assert len(truth) > 100
-    print(system, summary)
+    assert json.loads(done.stdout)["outcome"] == "complete"
+    track = open_beacons(tmp_path / "run").track()
+    rows = [k for k, seq in enumerate(track["seq"]) if seq in truth]
+    assert len(rows) > 0.9 * len(track["seq"])
+    squares = [hypot(track["x_m"][k] - truth[seq][0], track["y_m"][k] - truth[seq][1]) ** 2
+               for k in rows for seq in [track["seq"][k]]]  # fmt: skip
+    # As in one process, where the simulated robot of the same seed has 0.04, 0.05 and 0.005 m.
+    assert sqrt(sum(squares) / len(squares)) < {"zigbee": 0.07, "follow": 0.08, "cricket": 0.012}[system]
