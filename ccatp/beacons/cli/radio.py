@@ -14,6 +14,7 @@ from ccatp.cli import common
 
 if TYPE_CHECKING:
     from ccatp.beacons.config.models import CricketConfig
+    from ccatp.beacons.cricket.measured_map import MeasuredRanges
     from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 
 FILTERS = ("ekf-slam", "fixed-lag", "smoother")
@@ -123,10 +124,19 @@ _flag = partial(common.key_option, is_flag=True, flag_value=True, default=None)
     "ccatp radio map --config cricket --seeds 20",
     "ccatp radio map --method ekf --set cricket.phase2.pairs=zigzag --figure map.png",
     "ccatp radio map --ranges ranges.csv --offset --out beacons.toml --json",
+    "ccatp radio map --cricket N1=n1.log --cricket N2=n2.log --cricket N3=/dev/ttyUSB0",
     name="map",
 )
 @common.CONFIG_OPTION
 @click.option("--ranges", "ranges_file", type=common.PATH, help="Measured ranges (CSV) in place of simulated ones.")
+@click.option(
+    "--cricket", "crickets", multiple=True, metavar="[NAME=]PATH",
+    help="Serial line of a listening Cricket mote, recorded in a file or live from its device; one for each listener.",
+)  # fmt: skip
+@click.option(
+    "--seconds", type=click.FloatRange(min=0.1, max=86_400.0), default=60.0, show_default=True, metavar="S",
+    help="How long a device of --cricket is read.",
+)  # fmt: skip
 @click.option("--tags", "tags_file", type=common.PATH, help="Places of tags on their trolley (CSV).")
 @click.option("--truth", "truth_file", type=common.PATH, help="True places (CSV) to compare with.")
 @click.option(
@@ -148,22 +158,27 @@ _flag = partial(common.key_option, is_flag=True, flag_value=True, default=None)
 def radio_map(
     config_file: Path | None, ranges_file: Path | None, tags_file: Path | None, truth_file: Path | None,
     method: str, seeds: int, settings: Mapping[str, object], out_file: Path | None, figure_file: Path | None,
-    json_output: bool,
+    json_output: bool, crickets: tuple[str, ...], seconds: float,
 ) -> None:  # fmt: skip
     """Map beacons from the ranges between them."""
-    if ranges_file is None and (tags_file is not None or truth_file is not None):
+    is_measured = ranges_file is not None or bool(crickets)
+    if ranges_file is not None and crickets:
+        raise click.UsageError("--cricket and --ranges are two sources of ranges; give one of them")
+    if not is_measured and (tags_file is not None or truth_file is not None):
         raise click.UsageError("--tags and --truth go with --ranges; a simulation knows both")
-    if ranges_file is not None and seeds > 1:
+    if is_measured and seeds > 1:
         raise click.UsageError("--seeds is for simulated ranges; --ranges has been measured once")
     from ccatp.beacons.config.load import load_radio_config
     from ccatp.beacons.cricket.measured_map import report_lines
 
     system = {"system": "cricket"} if config_file is None else {}
-    cfg = load_radio_config(config_file, {**system, **settings}, simulates=ranges_file is None)
-    if ranges_file is None:
+    cfg = load_radio_config(config_file, {**system, **settings}, simulates=not is_measured)
+    if not is_measured:
         data = _simulated(cfg.cricket, method, range(cfg.run.seed, cfg.run.seed + seeds), out_file, figure_file)
     else:
-        data = _measured(cfg.cricket, method, (ranges_file, tags_file, truth_file), out_file, figure_file)
+        ranges, warnings = _ranges(cfg.cricket, ranges_file, crickets, seconds)
+        data = _measured(cfg.cricket, method, ranges, (tags_file, truth_file), out_file, figure_file)
+        data["warnings"] = [*warnings, *data["warnings"]]
     common.warn(data["warnings"])
     common.print_result(data, report_lines(data), json_output)
 
@@ -183,18 +198,29 @@ def _simulated(
     return campaign_data(campaign)
 
 
+def _ranges(
+    cfg: "CricketConfig", ranges_file: Path | None, crickets: tuple[str, ...], seconds: float
+) -> tuple["MeasuredRanges", list[str]]:
+    if ranges_file is not None:
+        from ccatp.beacons.datasets.sheets import read_ranges
+
+        return read_ranges(ranges_file, cfg.ranging.sigma_m), []
+    from ccatp.beacons.datasets.cricket_logs import listen, ranges_of
+
+    return ranges_of(cfg, [listen(source, seconds) for source in crickets])
+
+
 def _measured(
-    cfg: "CricketConfig", method: str, files: tuple[Path, Path | None, Path | None], out_file: Path | None,
-    figure_file: Path | None,
+    cfg: "CricketConfig", method: str, ranges: "MeasuredRanges", files: tuple[Path | None, Path | None],
+    out_file: Path | None, figure_file: Path | None,
 ) -> dict[str, Any]:  # fmt: skip
     import numpy as np
 
     from ccatp.beacons.cricket.measured_map import map_measured
-    from ccatp.beacons.datasets.sheets import read_places, read_ranges
+    from ccatp.beacons.datasets.sheets import read_places
     from ccatp.beacons.report.plots import MapPicture, draw_mote_map
 
-    ranges = read_ranges(files[0], cfg.ranging.sigma_m)
-    tags_m, truth_m = (None if file is None else read_places(file) for file in files[1:])
+    tags_m, truth_m = (None if file is None else read_places(file) for file in files)
     found = map_measured(cfg, method, ranges, tags_m, truth_m)
     if out_file is not None:
         _write(out_file, found[:3], "measured")

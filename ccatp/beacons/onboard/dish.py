@@ -12,6 +12,7 @@ from ccatp.onboard.devices.outputs import OpenLines, OutputLines
 from ccatp.onboard.hardware import HardwareError
 
 _SEARCHED = 1.1  # turns in which the switch must close
+_LEAVES = 0.1  # turns in which it must open
 _BEYOND = 0.25  # turns: the dish turns back by as much beyond straight ahead, then the cable is tight
 
 
@@ -42,7 +43,6 @@ class Dish:
         self._lines: OutputLines | None = None
         self._switch: InputLine | None = None
         self._is_leaving = False  # the switch is closed at first: step off it, and find where it closes
-        self._searched = 0
         self.position = self.lost_steps = 0
         self.is_homed = False
 
@@ -69,7 +69,6 @@ class Dish:
     def begin_homing(self) -> None:
         """Search straight ahead by ``home``. Without a switch the dish was turned there by hand."""
         self.is_homed = self._config.homing == "hand"
-        self._searched = 0
         self._is_leaving = self._switch is not None and self._is_closed()
 
     def home(self) -> bool:
@@ -108,8 +107,11 @@ class Dish:
         return False
 
     def _search(self, direction: int) -> None:
-        self._searched += 1
-        if self._searched > _SEARCHED * self._config.steps_per_turn:
+        """One step; further attempts do not wind the cable any further, because the position goes on counting."""
+        turn = self._config.steps_per_turn
+        if direction > 0 and self.position >= _LEAVES * turn:
+            raise HardwareError("dish: its end switch does not open; check devices.dish.switch_line, motor and supply")
+        if direction < 0 and self.position <= -_SEARCHED * turn:
             raise HardwareError("dish: no end switch in a turn; check devices.dish.switch_line, motor and supply")
         self._step(direction)
 

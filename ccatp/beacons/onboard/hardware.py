@@ -24,9 +24,14 @@ from ccatp.onboard.hardware import DeviceCheck, HardwareError
 
 PATIENCE_S = 8.0  # for the answer of a device, beside the discovery of radios
 LOW_SOC = 0.15
+WRITE_S = 0.05  # for the transmission of a few bytes on a slow line, also when this computer is busy
 REOPEN_S = 2.0  # between two attempts to open the lines of the dish
 _LINES_KEY = "the lines in devices.dish"
 Sleep = Callable[[float], object]
+
+
+def _open_port(device: str, baud: int, key: str) -> SerialPort:
+    return open_serial(device, baud, key, WRITE_S)
 
 
 def _open_lines(chip: str, values: Mapping[int, bool]) -> GpioLines:
@@ -41,7 +46,7 @@ def _open_input(chip: str, line: int) -> GpioInput:
 class BeaconAccess:
     """How the devices are reached, and what waits for them; tests replace it."""
 
-    open_port: Callable[[str, int, str], SerialPort] = open_serial
+    open_port: Callable[[str, int, str], SerialPort] = _open_port
     open_lines: OpenLines = _open_lines
     open_input: OpenInput = _open_input
     sleep: Sleep = time.sleep
@@ -94,7 +99,7 @@ class BeaconHardware:
 
     def _opening(self) -> dict[str, tuple[Callable[[], None], Callable[[], None]]]:
         """How each device is opened and closed, by its name, in order."""
-        clock, sleep = self._clock, self._access.sleep
+        clock, sleep = self._clock, self._wait
         found: dict[str, tuple[Callable[[], None], Callable[[], None]]] = {}
         if self.base is not None:
             found["base"] = partial(self.base.open, clock, sleep, PATIENCE_S), self.base.close
@@ -117,12 +122,15 @@ class BeaconHardware:
             self.scanner.poll(self._clock())
             if self.scanner.fault:
                 raise HardwareError(self.scanner.fault)
-            self._keep()
-            self._access.sleep(self._config.dish.step_s)
+            self._wait(self._config.dish.step_s)
+
+    def _wait(self, duration_s: float) -> None:
+        self._access.sleep(duration_s)
+        self._keep()
 
     def _keep(self) -> None:
         """The base holds its wheels while other devices are opened."""
-        if self.base is not None:
+        if self.base is not None and self.base.is_ready:
             self.base.poll(self._clock())
             self.base.drive(0.0, 0.0, self._clock())
 

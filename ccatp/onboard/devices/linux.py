@@ -72,14 +72,14 @@ class I2cBus:
         self._bus.close()
 
 
-def open_serial(device: str, baud: int, key: str = "devices.daq") -> SerialPort:
+def open_serial(device: str, baud: int, key: str = "devices.daq", write_s: float = 0.002) -> SerialPort:
     """Open a serial port for exclusive use, with reads that do not wait. Raises HardwareError.
 
-    ``key``: section of the configuration.
+    ``key``: section of the configuration. ``write_s``: longest time of a write.
     """
     serial = import_package("serial")
     try:
-        port: SerialPort = serial.Serial(device, baud, timeout=0, write_timeout=0.002, exclusive=True)
+        port: SerialPort = serial.Serial(device, baud, timeout=0, write_timeout=write_s, exclusive=True)
     except (OSError, ValueError) as error:
         raise explain(error, device, "dialout", key) from None
     return port

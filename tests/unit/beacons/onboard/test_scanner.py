@@ -167,7 +167,7 @@ def test_after_lost_steps_the_dish_is_homed_and_the_next_scan_is_right() -> None
 @pytest.mark.parametrize(
     ("switch", "message"),
     [(False, "dish: no end switch in a turn; check devices.dish.switch_line, motor and supply"),
-     (True, "dish: no end switch in a turn; check devices.dish.switch_line, motor and supply")],
+     (True, "dish: its end switch does not open; check devices.dish.switch_line, motor and supply")],
 )  # fmt: skip
 def test_a_switch_that_does_not_change(switch: bool, message: str) -> None:
     rig = Rig()
