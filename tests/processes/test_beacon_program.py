@@ -78,9 +78,9 @@ def test_missions_of_the_processes_through_the_drivers(
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["outcome"] == "complete"
     track = open_beacons(tmp_path / "run").track()
-    rows = [k for k, seq in enumerate(track["seq"]) if seq in truth]
-    assert len(rows) > 0.9 * len(track["seq"])
+    rows = [k for k, seq in enumerate(track["frame"]) if seq in truth]
+    assert len(rows) > 0.9 * len(track["frame"])
     squares = [hypot(track["x_m"][k] - truth[seq][0], track["y_m"][k] - truth[seq][1]) ** 2
-               for k in rows for seq in [track["seq"][k]]]  # fmt: skip
+               for k in rows for seq in [track["frame"][k]]]  # fmt: skip
     # As in one process, where the simulated robot of the same seed has 0.04, 0.05 and 0.005 m.
     assert sqrt(sum(squares) / len(squares)) < {"zigbee": 0.07, "follow": 0.08, "cricket": 0.012}[system]

@@ -8,7 +8,8 @@ PACKAGE, TESTS, TOOLS = ROOT / "ccatp", ROOT / "tests", ROOT / "tools"
 UNIT = TESTS / "unit"
 # Files of tests that are about no one module of the folder, or of those below it.
 OF_SEVERAL_MODULES = {
-    "beacons/report/test_beacon_report", "beacons/studies/test_beacon_studies", "beacons/test_driving",
+    "beacons/onboard/test_package", "beacons/report/test_beacon_report", "beacons/studies/test_beacon_studies",
+    "beacons/test_driving",
     "cli/test_cli_commands", "cli/test_refusals", "daemon/test_service", "daemon/test_telemetry",
     "beacons/cli/test_radio_map", "control/test_tracker_pid", "estimation/test_replay_buffer",
     "estimation/test_sample_validation", "mirror/test_length_judgement", "report/test_pages",
