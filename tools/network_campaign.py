@@ -67,6 +67,8 @@ class Outcome(NamedTuple):
     covered: dict[str, tuple[int, int]]
     false_findings: int
     undecided: int
+    left_out: int
+    has_frame: bool
     missed: int
     injected: int
 
@@ -149,12 +151,15 @@ def judge(cfg: Config, places: Places, truth: Truth) -> Outcome:
     named = found | {other for one in result.findings for other in (one.effect, *one.alternatives)}
     same = {(one.kind, one.of) for one in truth.injected}
     covered = _coverage(truth, result)
+    # A point that is left out determines nothing of its panel.
+    is_whole = np.repeat(~result.bad_points.reshape(len(places.panels), -1).any(axis=1), 3)
+    flat, sigmas, covariance = flat[is_whole], sigmas[is_whole], covariance[np.ix_(is_whole, is_whole)]
     covered["panel"] = int(np.sum(np.abs(flat) <= _INTERVAL * sigmas)), len(flat)
     return Outcome(
         state=result.state,
         seconds=seconds,
         before_m=float(np.sqrt(np.mean(before[:, 0] ** 2))),
-        after_m=float(np.sqrt(np.mean(errors[:, 0] ** 2))),
+        after_m=float(np.sqrt(np.mean(flat[::3] ** 2))),
         sigma_m=float(np.sqrt(np.mean(sigmas[::3] ** 2))),
         chi2=result.chi2 / truth.noise**2,
         dof=result.dof,
@@ -163,6 +168,8 @@ def judge(cfg: Config, places: Places, truth: Truth) -> Outcome:
         covered=covered,
         false_findings=sum((one.kind, one.of) not in same or one.since > 0 for one in found),
         undecided=sum(bool(one.alternatives) for one in result.findings),
+        left_out=int(result.bad_lengths.sum() + result.bad_points.sum()),
+        has_frame=result.has_frame,
         missed=len(same - {(one.kind, one.of) for one in named}) if result.has_frame else 0,
         injected=len(same),
     )
@@ -188,10 +195,13 @@ def _panel_covariance(places: Places, result: NetworkResult) -> FloatArray:
 
 
 def _coverage(truth: Truth, result: NetworkResult) -> dict[str, tuple[int, int]]:
-    """By kind: values inside their 95 % interval, and all of them, without those that the lengths do not determine."""
+    """By kind: values inside their 95 % interval, and all of them.
+
+    Without those that the lengths do not determine, and those that are suspect but not named.
+    """
     covered: dict[str, tuple[int, int]] = {}
     for effect, value in truth.values.items():
-        if effect in result.undetermined:
+        if effect in result.undetermined or effect in result.suspects:
             continue
         sigma = np.sqrt(np.diag(result.adjustment.covariance_of(effect)))
         total = result.adjustment.of(effect).copy()
@@ -249,7 +259,9 @@ def lines(outcomes: Sequence[tuple[str, Outcome]]) -> list[str]:
         f"(99 % band {low:.3f} to {high:.3f})",
         f"95 % intervals hold: {', '.join(shares)}",
         f"networks with a false finding: {false} ({100.0 * false / len(found):.1f} %); of {injected} injected errors "
-        f"{missed} not named, {sum(one.undecided for one in found)} findings undecided",
+        f"{missed} not named, {sum(one.undecided for one in found)} findings undecided; "
+        f"{sum(one.left_out for one in found)} lengths or points left out, "
+        f"{sum(not one.has_frame for one in found)} networks without a frame",
         f"CPU time of a network: {np.median(seconds):.2f} s in the median, {max(seconds):.2f} s at most",
     ]
 

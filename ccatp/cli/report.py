@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -100,6 +100,14 @@ class ReplayError(UsageError):
     """A run that cannot be replayed."""
 
 
+class Files(NamedTuple):
+    """Files that ``ccatp align`` writes."""
+
+    csv: Path | None
+    work: Path | None
+    figure: Path | None
+
+
 def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: str) -> None:
     if idle := [key for key in settings if not key.startswith(keys)]:
         raise ConfigError(f"command line: {idle[0]}: has no effect on {what}; what has: {', '.join(keys)}")
@@ -146,6 +154,7 @@ def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: s
 )
 @common.settings_option("A key of align or mirror, or robot.puck_height_m, as in align.point_floor_m=2e-6.")
 @click.option("--csv", "csv_file", type=common.OutputFile(), help="Write a line a panel (CSV).")
+@click.option("--work-list", type=common.OutputFile(), help="Write the moves as steps of work, a line each (CSV).")
 @common.figure_option("Draw deviations and moves")
 @common.JSON_OPTION
 def align(
@@ -159,6 +168,7 @@ def align(
     others: tuple[Path, ...],
     settings: Mapping[str, object],
     csv_file: Path | None,
+    work_list: Path | None,
     figure_file: Path | None,
     json_output: bool,
 ) -> int:
@@ -171,7 +181,7 @@ def align(
         from ccatp.cli.align_points import PointOptions
 
         options = PointOptions(points, references, frame, unit, 1e-3 * offset_mm, sigma_um and 1e-6 * sigma_um)
-        return _align_points(run_dir, settings, options, csv_file, figure_file, json_output)
+        return _align_points(run_dir, settings, options, Files(csv_file, work_list, figure_file), json_output)
     if run_dir is None:
         raise UsageError("name the directory of a run, or --points FILE")
     from ccatp.mirror.mirror import build_mirror
@@ -195,11 +205,12 @@ def align(
         "seed": cfg.run.seed,
         "points": {"total": len(survey.planned), "measured": len(survey.measured), "outliers": outliers},
         "adjusters": list(result.panels[0].adjusters) if result.panels else [],
+        "adjuster_places_mm": _places_mm(mirror, result),
         "puck_height_sigma_um": round(cfg.align.puck_height_sigma_m * 1e6, 4),
     }
     warnings = [*survey.warnings, *remarks(network), *result.warnings]
+    warnings += _write_files(cfg, mirror, result, Files(csv_file, work_list, figure_file), str(run_dir))
     common.warn(warnings)
-    _write_files(mirror, result, csv_file, figure_file, str(run_dir))
     lines = [*table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m), *network_lines(network)]
     data = {**facts, **result_data(result, comparison), "network": network_data(network), "warnings": warnings}
     common.print_result(data, lines, json_output)
@@ -210,8 +221,7 @@ def _align_points(
     run_dir: Path | None,
     settings: Mapping[str, object],
     options: "PointOptions",
-    csv_file: Path | None,
-    figure_file: Path | None,
+    files: Files,
     json_output: bool,
 ) -> int:
     from ccatp.cli.align_points import align_points
@@ -231,28 +241,44 @@ def _align_points(
             "outliers": sum(len(panel.outliers) for panel in found.result.panels),
         },
         "adjusters": list(found.result.panels[0].adjusters) if found.result.panels else [],
+        "adjuster_places_mm": _places_mm(found.mirror, found.result),
         "puck_height_sigma_um": 0.0,
     }
     warnings = [*found.lines[1:], *found.result.warnings]
+    warnings += _write_files(found.cfg, found.mirror, found.result, files, str(options.points))
     common.warn(warnings)
-    _write_files(found.mirror, found.result, csv_file, figure_file, str(options.points))
     lines = [*table_lines(facts, found.result, None, 0.0), *found.lines]
     data = {**facts, **result_data(found.result, None), "instrument": found.data, "warnings": warnings}
     common.print_result(data, lines, json_output)
     return 0
 
 
-def _write_files(
-    mirror: "Mirror", result: "SurveyResult", csv_file: Path | None, figure_file: Path | None, name: str
-) -> None:
-    if csv_file is not None:
-        from ccatp.report.tables import csv_lines, panel_table
+def _places_mm(mirror: "Mirror", result: "SurveyResult") -> list[list[float]]:
+    """Places of the adjusters in the panel frame; those of all panels are the same within 0.1 mm."""
+    from ccatp.mirror.panel_alignment import adjuster_places
 
-        common.write_lines("--csv", csv_file, csv_lines(panel_table(mirror, result.panels)))
-    if figure_file is not None:
+    if not result.panels:
+        return []
+    places = adjuster_places(mirror, result.panels[0].panel)[1].tolist()
+    return [[round(1e3 * value, 1) for value in place] for place in places]
+
+
+def _write_files(cfg: "Config", mirror: "Mirror", result: "SurveyResult", files: Files, name: str) -> tuple[str, ...]:
+    """Write the files that are asked for; what the work list does not contain."""
+    from ccatp.mirror.adjuster_work import work_list
+    from ccatp.report.tables import csv_lines, panel_table, work_table
+
+    refused: tuple[str, ...] = ()
+    if files.csv is not None:
+        common.write_lines("--csv", files.csv, csv_lines(panel_table(mirror, result.panels)))
+    if files.work is not None:
+        steps, refused = work_list(mirror, cfg.mirror.adjusters, result.panels)
+        common.write_lines("--work-list", files.work, csv_lines(work_table(steps)))
+    if files.figure is not None:
         from ccatp.report.mirror_map import draw_alignment
 
-        draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", name)
+        draw_alignment(mirror, result, files.figure, f"{mirror.name}: {len(result.panels)} panels", name)
+    return refused
 
 
 def _measured_with(run_dir: Path, cfg: "Config") -> "Sequence[Measured]":

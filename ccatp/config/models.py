@@ -562,6 +562,15 @@ class PanelsConfig(Model):
     adjusters_mm: dict[str, Pair]  # vertical adjusters, offsets in the panel's tangent plane
 
 
+class AdjustersConfig(Model):
+    """Names and limits of the vertical adjusters; 0: not known, no limit."""
+
+    order: Literal["manufacturer", "observatory"] = "manufacturer"  # whose names the adjusters have
+    pitch_mm: NonNegative = 0.0  # move per turn of a screw
+    travel_mm: NonNegative = 0.0  # largest move of an adjuster in one work list
+    step_mm: NonNegative = 0.0  # an adjuster is never ahead of the others of its panel by more than this
+
+
 class BaseConfig(Model):
     """Where the robot starts and returns to, in a panel frame."""
 
@@ -592,6 +601,7 @@ class MirrorConfig(Model):
     panels: PanelsConfig
     base: BaseConfig
     collimators: CollimatorsConfig
+    adjusters: AdjustersConfig = AdjustersConfig()
 
 
 class Config(Model):

@@ -1,6 +1,6 @@
 """The geometry of a mirror for the robot: surface, frames, panels, rim and poses."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from math import atan2, cos, hypot, pi, sin
 from typing import Literal
@@ -48,11 +48,9 @@ class Mirror:
         self.rim = build_rim(self.grid)
         self._points_x = tuple(x * 1e-3 for x in cfg.panels.points_x_mm)
         self._points_y = tuple(y * 1e-3 for y in cfg.panels.points_y_mm)
-        self._adjusters = {
-            # The data have offsets along the axes of the mirror frame; on M1 the deck's x has the opposite direction.
-            name: (self.drive_side * x * 1e-3, y * 1e-3)
-            for name, (x, y) in cfg.panels.adjusters_mm.items()
-        }
+        # The data have offsets along the axes of the mirror frame; on M1 the deck's x has the opposite direction.
+        adjusters = _named(cfg.panels.adjusters_mm, cfg.adjusters.order)
+        self._adjusters = {name: (self.drive_side * x * 1e-3, y * 1e-3) for name, (x, y) in adjusters.items()}
         self.channels = cfg.collimators.channels
         self.collimators_m: FloatArray = np.array(cfg.collimators.positions_world_mm, dtype=np.float64) * 1e-3
         self.panel_at, self.is_on_panel = self.grid.panel_at, self.grid.is_on_panel
@@ -210,6 +208,21 @@ class Mirror:
 
 def _dot(a: Vector3, b: Vector3) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+# Names of the observatory's own tool, by the signs of an adjuster's x and y in the axes of the mirror frame.
+_OBSERVATORY = {(-1, 1): "v1", (-1, -1): "v2", (1, 1): "v3", (1, -1): "v4", (0, 0): "v5"}
+
+
+def _named(adjusters_mm: Mapping[str, tuple[float, float]], order: str) -> dict[str, tuple[float, float]]:
+    """Offsets of the adjusters by their names in an order."""
+    if order == "manufacturer":
+        return dict(adjusters_mm)
+    return dict(sorted((_OBSERVATORY[_sign(x), _sign(y)], (x, y)) for x, y in adjusters_mm.values()))
+
+
+def _sign(value: float) -> int:
+    return (value > 0.0) - (value < 0.0)
 
 
 def build_mirror(cfg: MirrorConfig) -> Mirror:

@@ -32,7 +32,7 @@ from ccatp.mirror.network_model import (
 )
 
 UNDETERMINED = 0.9  # ratio of the posterior to the prior sigma from which an effect is not determined by the lengths
-_SUSPECT = 0.01  # chance of a score by noise below which an effect gets the wide prior
+_SUSPECT = 0.02  # chance of a score by noise below which an effect gets the wide prior
 _CLEAR = 13.8  # least difference of the chi-squares of two explanations, one of which is a thousand times as likely
 _GRID = 100  # first points at which a change is looked for; then at every point near the best
 _LEAST_PART = 5  # points before and after a change
@@ -79,7 +79,8 @@ class Finding(NamedTuple):
 class NetworkResult(NamedTuple):
     """The network of one or more surveys.
 
-    ``undetermined``: effects of which the lengths say nothing. ``noise``: measured over configured noise of a length,
+    ``suspects``: effects with the wide prior that are not named. ``undetermined``: effects of which the lengths say
+    nothing. ``noise``: measured over configured noise of a length,
     at least 1; ``is_noisy``: significantly larger. ``bad_lengths`` (k, m): single lengths that contradict all others,
     left out; ``bad_points`` (k,): points whose lengths contradict each other, left out. ``has_frame``: enough
     collimators agree with each other to say which of the others moved.
@@ -89,6 +90,7 @@ class NetworkResult(NamedTuple):
     given: SurveyLengths
     adjustment: Adjustment
     findings: tuple[Finding, ...]
+    suspects: tuple[Effect, ...]
     undetermined: tuple[Effect, ...]
     noise: float
     is_noisy: bool
@@ -340,11 +342,14 @@ class NetworkSearch:
         noise = sqrt(max(chi2 / dof, 1.0))
         if noise != adjustment.noise:
             adjustment = adjust(self._used(found), dict(found.sigmas), noise, adjustment)
+        findings = tuple(findings)
+        named = {other for one in findings for other in (one.effect, *one.alternatives)}
         return NetworkResult(
             state=state,
             given=self._given,
             adjustment=adjustment,
-            findings=tuple(findings),
+            findings=findings,
+            suspects=tuple(one for one in adjustment.slices if one in found.wide - named),
             undetermined=tuple(one for one in adjustment.slices if self._ratio(found, adjustment, one) > UNDETERMINED),
             noise=noise,
             is_noisy=float(chdtrc(dof, chi2)) < self._noise_chance,

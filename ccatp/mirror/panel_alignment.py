@@ -185,10 +185,14 @@ def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
 
 
 class Moves(NamedTuple):
-    """Moves (a,) in the order of the adjusters' names; covariance (a, a), whose rank is that of the modes."""
+    """Moves (a,) in the order of the adjusters' names; covariance (a, a), whose rank is that of the modes.
+
+    ``common_m`` (a, r): change of the moves per error that other panels share.
+    """
 
     values_m: FloatArray
     covariance_m2: FloatArray
+    common_m: FloatArray
 
     @property
     def sigma_m(self) -> FloatArray:
@@ -207,7 +211,7 @@ def adjuster_places(mirror: Mirror, panel: PanelId) -> tuple[tuple[str, ...], Fl
 def adjuster_moves(fit: ModeFit, modes: Modes, places_m: FloatArray) -> Moves:
     """Moves that remove a fitted displacement; ``places_m``: adjusters in the panel frame, shape (a, 2), m."""
     at = -modes(places_m)
-    return Moves(at @ fit.values, at @ fit.covariance @ at.T)
+    return Moves(at @ fit.values, at @ fit.covariance @ at.T, at @ fit.common)
 
 
 _CURVATURES = 3

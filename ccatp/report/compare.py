@@ -1,5 +1,6 @@
 """Two surveys beside each other, called A and B: what changed on the mirror, the page, lines for a terminal, data."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from scipy.special import chdtrc, chdtri
 
 from ccatp.config.files import write_file
 from ccatp.core import FloatArray, PanelId
+from ccatp.mirror.adjuster_work import Made, check_moves, repeatability_m
 from ccatp.mirror.mirror_alignment import joint_covariance
 from ccatp.mirror.network_points import CalibratedSurveys
 from ccatp.mirror.panel_alignment import PanelResult, mirror_wavefront
@@ -92,7 +94,10 @@ class RunPair:
     """Two runs, called A and B as on the page, and the changes between them.
 
     ``panels``: the fitted panels of each run; ``wavefronts``: half-wavefront errors of the panels that both runs have,
-    or None. Points and panels are compared only if the mirror is the same; otherwise ``warning`` is not empty.
+    or None. ``checks``: the moves that A plans against the change that B shows, if any panel has moved;
+    ``repeatability_m``: of a point, by both surveys.
+
+    Points and panels are compared only if the mirror is the same; otherwise ``warning`` is not empty.
     """
 
     def __init__(self, a: Findings, b: Findings) -> None:
@@ -108,6 +113,11 @@ class RunPair:
         self.changes = panel_changes(
             [(self.panels[0][panel], self.panels[1][panel]) for panel in common], differing_errors(a.network, b.network)
         )
+        both = [[self.panels[k][panel] for panel in common] for k in (0, 1)]
+        has_moved = self.changes is not None and any(panel.has_moved for panel in self.changes.panels)
+        self.checks = check_moves(both[0], both[1], differing_errors(a.network, b.network)) if has_moved else ()
+        self.verdicts = Counter(one.made for one in self.checks)
+        self.repeatability_m = repeatability_m(both[0], both[1])
         self.wavefronts = [
             mirror_wavefront([panel.rigid.wavefront for panel in panels.values() if panel.panel in common])
             for panels in self.panels
@@ -211,6 +221,7 @@ def compare_page(pair: RunPair) -> str:
     return render(
         "compare.html",
         pair=pair,
+        as_planned=Made.AS_PLANNED,
         figures=page_figures(compare_drawings(pair)),
         compared=compared_figures(pair),
         changed=changed_keys(ours, others),
@@ -249,7 +260,9 @@ def compare_lines(pair: RunPair) -> list[str]:
     rows = [one for one in compared_figures(pair) if one.change != 0.0]
     names = [one.name.replace("\u00b5", "u").replace("\u03c3", "sigma") for one in rows]
     width = max(map(len, names), default=0) + 2
-    return render("compare.txt", pair=pair, rows=[*zip(names, rows, strict=True)], width=width).splitlines()
+    return render(
+        "compare.txt", pair=pair, as_planned=Made.AS_PLANNED, rows=[*zip(names, rows, strict=True)], width=width
+    ).splitlines()
 
 
 def compare_data(pair: RunPair) -> dict[str, Any]:
@@ -264,6 +277,18 @@ def compare_data(pair: RunPair) -> dict[str, Any]:
         "chi2": changes and round(changes.chi2, 4),
         "dof": changes and changes.dof,
         "agree": changes and changes.agree,
+        "moves": [
+            {
+                **one.panel._asdict(),
+                "adjuster": one.adjuster,
+                "planned_um": round(MICRO * one.planned_m, 4),
+                "measured_um": round(MICRO * one.measured_m, 4),
+                "sigma_um": round(MICRO * one.sigma_m, 4),
+                "made": one.made.value,
+            }
+            for one in pair.checks
+        ],
+        "repeatability_um": pair.repeatability_m and round(MICRO * pair.repeatability_m, 4),
     }
 
 

@@ -79,6 +79,7 @@ def run_page(found: Findings) -> str:
         within_mm=f"{WITHIN_MM:.0f}",
         never=Counter(verdict.why for verdict in found.points if verdict.grade is Grade.OPEN),
         panels=panels,
+        bent=[panel for panel in fitted if panel.bending is not None and panel.explained.has_shape],
         worst=sorted(panels, key=lambda row: abs(row[2][0]), reverse=True)[:_FEW],
         few=_FEW,
         events=events_of(record.log),

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from ccatp.config.files import write_file
 from ccatp.core import PointId
+from ccatp.mirror.adjuster_work import Step
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import PanelResult, adjuster_places
 from ccatp.report.alignment import panel_data, worst_corner
@@ -155,6 +156,8 @@ def panel_table(mirror: Mirror, panels: Sequence[PanelResult]) -> Table:
         "outliers": "numbers of the points that were not used for the fit",
         **{f"{name}_um": f"move of adjuster {name}, > 0 towards the robot" for name in names},
         **{f"sigma_{name}_um": _SIGMA for name in names},
+        **{f"bending_{name}_um": f"move of adjuster {name} that also removes twist and bowl" for name in names},
+        **{f"sigma_bending_{name}_um": _SIGMA for name in names},
         "is_bent": "1: the curvatures of the panel are significant",
         "rms_before_um": "half-wavefront error before the moves",
         "rms_after_um": "half-wavefront error predicted after the moves",
@@ -169,6 +172,9 @@ def panel_table(mirror: Mirror, panels: Sequence[PanelResult]) -> Table:
         data |= zip([f"sigma_{name}" for name in _FIT], data["sigma"], strict=True)
         data |= zip([f"{name}_um" for name in names], data["adjusters_um"], strict=True)
         data |= zip([f"sigma_{name}_um" for name in names], data["adjusters_sigma_um"], strict=True)
+        if panel.bending is not None:
+            data |= zip([f"bending_{name}_um" for name in names], data["bending_adjusters_um"], strict=True)
+            data |= zip([f"sigma_bending_{name}_um" for name in names], data["bending_adjusters_sigma_um"], strict=True)
         data |= zip(("worst_corner_um", "sigma_worst_corner_um"), corner_um, strict=True)
         rows.append(data)
     return Table(columns, rows)
@@ -180,6 +186,38 @@ def all_panels_table(found: Findings) -> Table:
     table = panel_table(found.record.mirror, () if result is None else result.panels)
     others = () if result is None else result.undetermined
     return Table(table.columns, [*table.rows, *({**one.panel._asdict(), "points": one.points} for one in others)])
+
+
+_WORK = {
+    "round": "all adjusters of a panel are turned once in a round",
+    "rounds": "number of rounds of the panel",
+    **_PLACE,
+    "adjuster": "name of the adjuster",
+    "x_m": "place of the adjuster in the frame of the panel",
+    "y_m": "place of the adjuster in the frame of the panel",
+    "move_um": "move of this step, > 0 towards the robot",
+    "turns": "turns of the screw; empty if its pitch is not configured",
+    "sigma_move_um": "standard deviation of the whole move",
+}
+
+
+def work_table(steps: Sequence[Step]) -> Table:
+    """The steps of a work list, in their order."""
+    rows = [
+        {
+            **step.panel._asdict(),
+            "round": step.round,
+            "rounds": step.rounds,
+            "adjuster": step.adjuster,
+            "x_m": round(step.x_m, 6),
+            "y_m": round(step.y_m, 6),
+            "move_um": round(1e6 * step.move_m, 4),
+            "turns": None if step.turns is None else round(step.turns, 5),
+            "sigma_move_um": round(1e6 * step.sigma_m, 4),
+        }
+        for step in steps
+    ]
+    return Table(_WORK, rows)
 
 
 def moves_table(found: Findings) -> Table:

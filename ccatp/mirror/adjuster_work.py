@@ -1,0 +1,149 @@
+"""The work at the adjusters: steps that make the moves of a survey, and whether a later survey shows them made."""
+
+from collections.abc import Sequence
+from enum import StrEnum
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.models import AdjustersConfig
+from ccatp.core import FloatArray, PanelId
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.panel_alignment import Moves, PanelResult, adjuster_places
+
+_SIGMAS = 4.0  # of a difference that noise does not make in the several hundred adjusters of a mirror
+_LEAST_SHARE = 0.5  # of a move, below which it was made in part
+
+
+class Step(NamedTuple):
+    """One turn of one adjuster: its place in the panel frame, m; move, m; ``turns`` of the screw if known.
+
+    ``round``: all adjusters of a panel are turned once in a round, so that none is ahead of the others by more than
+    the configured step.
+    """
+
+    panel: PanelId
+    round: int
+    rounds: int
+    adjuster: str
+    x_m: float
+    y_m: float
+    move_m: float
+    sigma_m: float
+    turns: float | None
+
+
+class WorkList(NamedTuple):
+    """The steps of all panels, and the moves that exceed the travel, as texts; such panels have no steps."""
+
+    steps: tuple[Step, ...]
+    refused: tuple[str, ...]
+
+
+def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult]) -> WorkList:
+    """The rigid moves of the panels as steps in an order that exceeds no limit."""
+    steps, refused = list[Step](), list[str]()
+    travel_m, step_m, pitch_m = (1e-3 * value for value in (cfg.travel_mm, cfg.step_mm, cfg.pitch_mm))
+    for panel in panels:
+        moves = panel.rigid.moves
+        worst = int(np.argmax(np.abs(moves.values_m)))
+        if travel_m and abs(moves.values_m[worst]) > travel_m:
+            refused.append(
+                f"panel {panel.panel.row}/{panel.panel.col}: {panel.adjusters[worst]} has to move by "
+                f"{1e3 * moves.values_m[worst]:+.3f} mm, its travel is {cfg.travel_mm:g} mm: it is not in the work list"
+            )
+            continue
+        rounds = ceil(abs(float(moves.values_m[worst])) / step_m - 1e-9) if step_m else 1
+        places = adjuster_places(mirror, panel.panel)[1].tolist()
+        for number in range(1, max(rounds, 1) + 1):
+            for name, (x_m, y_m), move, sigma in zip(
+                panel.adjusters, places, moves.values_m.tolist(), moves.sigma_m.tolist(), strict=True
+            ):
+                part = move / max(rounds, 1)
+                turns = part / pitch_m if pitch_m else None
+                steps.append(Step(panel.panel, number, max(rounds, 1), name, x_m, y_m, part, sigma, turns))
+    return WorkList(tuple(steps), tuple(refused))
+
+
+class Made(StrEnum):
+    """Whether a move was made."""
+
+    AS_PLANNED = "as planned"
+    NOT = "did not move"
+    WRONG_WAY = "moved the wrong way"
+    PARTLY = "moved too little"
+    TOO_FAR = "moved too far"
+
+
+class MoveCheck(NamedTuple):
+    """One adjuster: planned and measured move, m, the sigma of their difference, and the verdict."""
+
+    panel: PanelId
+    adjuster: str
+    planned_m: float
+    measured_m: float
+    sigma_m: float
+    made: Made
+
+
+def made_of(planned_m: float, measured_m: float, sigma_m: float) -> Made:
+    """The verdict on one move; a planned move within the noise is made unless something else is seen."""
+    limit = _SIGMAS * sigma_m
+    if abs(measured_m - planned_m) <= limit:
+        return Made.AS_PLANNED
+    if abs(measured_m) <= limit:
+        return Made.NOT
+    if measured_m * planned_m < 0.0 and abs(planned_m) > limit:
+        return Made.WRONG_WAY
+    if abs(measured_m) < abs(planned_m):
+        return Made.PARTLY
+    return Made.TOO_FAR
+
+
+def check_moves(
+    before: Sequence[PanelResult], after: Sequence[PanelResult], errors: tuple[slice, slice]
+) -> tuple[MoveCheck, ...]:
+    """Moves planned by the survey ``before``, and the change of the panels at their adjusters that ``after`` shows.
+
+    Five adjusters can be told apart from nine points: the change has twist and bowl. ``errors``: those of the errors
+    common to the panels of a survey that differ between the surveys.
+    """
+    found = []
+    for one, other in zip(before, after, strict=True):
+        if one.bending is None or other.bending is None:
+            continue
+        measured = one.bending.moves.values_m - other.bending.moves.values_m
+        plans = one.bending.moves, other.bending.moves
+        variances = sum(_own_variances(plan, part) for plan, part in zip(plans, errors, strict=True))
+        for name, planned, moved, sigma in zip(
+            one.adjusters,
+            one.rigid.moves.values_m.tolist(),
+            measured.tolist(),
+            np.sqrt(variances).tolist(),
+            strict=True,
+        ):
+            found.append(MoveCheck(one.panel, name, planned, moved, sigma, made_of(planned, moved, sigma)))
+    return tuple(found)
+
+
+def _own_variances(moves: Moves, errors: slice) -> FloatArray:
+    """Variances of moves without the errors that cancel between two surveys."""
+    cancel = np.delete(moves.common_m, np.arange(moves.common_m.shape[1])[errors], axis=1)
+    return np.asarray(np.diag(moves.covariance_m2) - np.sum(cancel**2, axis=1))
+
+
+def repeatability_m(before: Sequence[PanelResult], after: Sequence[PanelResult]) -> float | None:
+    """Standard deviation of a point: residuals of the planes of two surveys, point by point; None without any."""
+    squares, count = 0.0, 0
+    for one, other in zip(before, after, strict=True):
+        residuals = []
+        for panel in (one, other):
+            kept = [point for point, is_kept in zip(panel.deviations.points, panel.is_kept, strict=True) if is_kept]
+            residuals.append(dict(zip(kept, panel.fit.residuals_m.tolist(), strict=True)))
+        common = residuals[0].keys() & residuals[1].keys()
+        # Planes take three of the differences.
+        if len(common) > 3:
+            squares += sum((residuals[1][point] - residuals[0][point]) ** 2 for point in common)
+            count += len(common) - 3
+    return float(np.sqrt(squares / count / 2.0)) if count else None
