@@ -76,11 +76,13 @@ def test_missions_of_the_processes_through_the_drivers(
         assert process.stdout is not None
         truth = {row[0]: row[2:4] for row in json.loads(process.stdout.read())}
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["outcome"] == "complete"
+    summary = json.loads(done.stdout)
+    assert summary["outcome"] == "complete"
+    begun_s = summary["map"].get("map_time_s") or 0.0  # before it has mapped motes, the robot stands at its start
     track = open_beacons(tmp_path / "run").track()
-    rows = [k for k, seq in enumerate(track["frame"]) if seq in truth]
-    assert len(rows) > 0.9 * len(track["frame"])
+    rows = [k for k, seq in enumerate(track["frame"]) if seq in truth and track["t_s"][k] >= begun_s]
+    assert len(rows) > 0.5 * len(track["frame"])
     squares = [hypot(track["x_m"][k] - truth[seq][0], track["y_m"][k] - truth[seq][1]) ** 2
                for k in rows for seq in [track["frame"][k]]]  # fmt: skip
-    # As in one process, where the simulated robot of the same seed has 0.04, 0.05 and 0.005 m.
-    assert sqrt(sum(squares) / len(squares)) < {"zigbee": 0.07, "follow": 0.08, "cricket": 0.012}[system]
+    # Twice the error of the simulated robot of this seed, which draws other noise: 0.038, 0.055 and 0.0053 m.
+    assert sqrt(sum(squares) / len(squares)) < {"zigbee": 0.076, "follow": 0.11, "cricket": 0.0106}[system]
