@@ -283,18 +283,16 @@ class LocalizerBase(ABC):
                 intake.restart()
             self._resync(t_s, last_s)
         means.take(encoders, dt_s)
-        if imu:
-            believed = self._imu_gate.admit(imu, means.yaw_rad_s, t_s - imu[-1][0] - dt_s)
-            if len(believed) != len(imu):
-                self.counts["imu_doubted"] += len(imu)
-            imu = believed
-        imu, (right, left) = intake.imu(t_s, imu), intake.wheels(t_s, encoders)
+        timely, (right, left) = intake.imu(t_s, imu), intake.wheels(t_s, encoders)
+        if imu and not self._imu_gate.admit(imu, means.yaw_rad_s, t_s - imu[-1][0] - dt_s):
+            self.counts["imu_doubted"] += len(imu)
+            timely = ()
         if intake.backward_source:
             self._request_hold(SENSOR_BACKWARD.cause(sensor=intake.backward_source))
             intake.backward_source = ""
         self.coasted = None
         try:
-            self._use(dt_s, imu, right, left, edges, gravity, set_points)
+            self._use(dt_s, timely, right, left, edges, gravity, set_points)
         except FilterDiverged as error:
             self._freeze(error)
 

@@ -119,7 +119,7 @@ class TurnTimingMonitor(Monitor):
             follows &= self._by_gyroscope.add(at_s, 0.5 * (self._wz_rad_s + wz))
             self._wz_rad_s = wz
         if wheels and yaw_rad_s is not None:
-            follows &= self._by_wheels.add(wheels[-1].t_s, yaw_rad_s)
+            follows &= self._by_wheels.add(wheels[-1][0], yaw_rad_s)
         if follows and self.waits_s <= _LONGEST_WAIT_S:
             self._take_steps(t_s)
         else:

@@ -14,7 +14,7 @@ from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.trajectory import bridged
 from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
 from ccatp.beacons.estimation.beacon_slam import BeaconSlam, recorded_slam
-from ccatp.beacons.estimation.causal import filter_run
+from ccatp.beacons.estimation.causal import filter_run, follow
 from ccatp.beacons.estimation.evaluation import judge, result_data
 from ccatp.beacons.estimation.measurement_models import (
     LevelModel,
@@ -398,9 +398,12 @@ def test_the_map_of_a_fixed_lag_fits_all_that_is_kept_in_the_frame_of_its_path()
         assert track.map_covariance[at, at] == pytest.approx(fix.covariance)
     one, *_ = track.beacons
     early = run.readings.where((run.readings.times_s < 30.0) | (run.readings.beacon != run.beacon_ids.index(one)))
-    forgetful = lagged_run(replace(run, readings=early), *given, no_clock, lag.model_copy(update={"map_s": 10.0}))
-    of_filter = filter_run(replace(run, readings=early), *given, no_clock).beacons[one]
-    assert forgetful.beacons[one][:2] == pytest.approx(of_filter[:2])
+    without_it, short = replace(run, readings=early), lag.model_copy(update={"map_s": 10.0})
+    forgetful, (of_filter, _) = (
+        lagged_run(without_it, *given, no_clock, short),
+        follow(without_it, *given, no_clock, lag=short),
+    )
+    assert forgetful.beacons[one][:2] == of_filter.beacons[one][:2]
 
 
 def test_a_calibration_that_no_reading_determines_is_not_reported() -> None:
