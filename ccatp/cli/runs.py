@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,7 @@ def remove_runs(
             raise ConfigError(*refused, shows_all=True)  # nothing is removed
     elif not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder; name one that holds run directories with --folder")
-    chosen = run_dirs or removal.chosen_by_age(folder, older_than_days=older_than_days, keep=keep)
+    chosen = run_dirs or removal.chosen_by_age(folder, older_than_days=older_than_days, keep=keep, now_s=time.time())
     sizes = {run_dir: removal.size_bytes(run_dir) for run_dir in chosen}
     total_mb = sum(sizes.values()) / 1e6
     if chosen and not yes:

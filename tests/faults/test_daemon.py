@@ -336,6 +336,7 @@ LABELS = {
     "daemon/operator/alarms.py",  # as operators read it; what decides is the order
     "daemon/supervision/run_dir.py",
     "cli/prepare.py",
+    "cli/runs.py",  # for how many days nothing has changed a file
     "daemon/operator/ocs_agent.py",
     "commissioning/probes.py",
     "records/recorder.py",  # log times in UTC; what is read again goes by the robot's clock

@@ -1,8 +1,7 @@
 """Removal of run directories: which may be removed, and their removal under the locks of a run."""
 
 import shutil
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -55,18 +54,17 @@ def remove(run_dir: Path, *, force: bool) -> None:
             raise RefusedError(f"{error.filename or run_dir}: cannot be removed: {error.strerror}") from error
 
 
-def chosen_by_age(
-    folder: Path, *, older_than_days: float | None, keep: int | None, now_s: Callable[[], float] = time.time
-) -> Sequence[Path]:
+def chosen_by_age(folder: Path, *, older_than_days: float | None, keep: int | None, now_s: float) -> Sequence[Path]:
     """The runs in a folder that may be removed without force, the oldest first.
 
-    ``older_than_days``: whose newest file is older. ``keep``: all but so many of the newest runs of the folder.
+    ``older_than_days``: whose newest file is older; ``now_s`` is of the clock of the files. ``keep``: all but so many
+    of the newest runs of the folder.
     """
     aged = sorted((_changed_s(path.parent), path.parent) for path in folder.glob(f"*/{CONFIG}"))
     if keep is not None:
         aged = aged[: max(len(aged) - keep, 0)]
     if older_than_days is not None:
-        aged = [row for row in aged if now_s() - row[0] > older_than_days * DAY_S]
+        aged = [row for row in aged if now_s - row[0] > older_than_days * DAY_S]
     return [run_dir for _, run_dir in aged if refusal(run_dir, force=False) is None]
 
 

@@ -72,7 +72,7 @@ def test_old_runs_are_chosen_by_age_and_number(
     for k, name in enumerate("abcde"):
         make_run(tmp_path / name, days_old=50.0 - 12.0 * k)
     make_run(tmp_path / "resumable", measured=1, days_old=99.0)
-    chosen = chosen_by_age(tmp_path, older_than_days=older_than_days, keep=keep, now_s=lambda: NOW_S)
+    chosen = chosen_by_age(tmp_path, older_than_days=older_than_days, keep=keep, now_s=NOW_S)
     assert "".join(path.name for path in chosen) == names
 
 
