@@ -18,7 +18,7 @@ from ccatp.core import BoolArray, FloatArray, IntArray
 _AXES = 3
 _MOST_ITERATIONS = 30
 _LEAST_VISIBLE = 1e-9  # part of the information of a candidate that the unknowns must leave; less is rounding
-_REST_M = 1e-10  # largest change of a point in the last iteration; a thousandth of the noise of a length
+_CONVERGED_M = 1e-10  # largest change of a point in the last iteration; a thousandth of the noise of a length
 
 
 class EffectKind(StrEnum):
@@ -238,7 +238,7 @@ def adjust(
         move = (system.gain @ (system.residuals - system.design @ step)[..., None])[..., 0]
         values, points = values + step, points + move
         system = _system(given, slices, values, points, noise)
-        if np.max(np.abs(move), initial=0.0) <= _REST_M:
+        if np.max(np.abs(move), initial=0.0) <= _CONVERGED_M:
             break
     weighted = (system.weights @ system.residuals[..., None])[..., 0]
     return Adjustment(
