@@ -22,6 +22,8 @@ ALLOWED = {
     "state.abort_cause != self._in_force[0]": "likewise",
     "cause != verdict.cause": "likewise",
     "cause not in [one.cause for one in found]": "likewise",
+    "after.abort_cause != s.abort_cause": "likewise: whether a request would change the cause",
+    "turn.bars == turn.why": "likewise: whether what bars the resume is what holds, or something else",
     "cause in texts": "an alarm does not repeat the same text",
     "fault.signal == 'laser'": "a fault plan names the simulated signal",
     "fault.signal not in SIGNALS": "likewise",

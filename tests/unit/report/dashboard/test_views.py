@@ -288,7 +288,7 @@ async def test_plots_and_path_of_a_dashboard_that_came_late_are_read_from_the_re
 
 def test_the_last_fix_and_the_limits_that_go_with_what_is_shown(view: SurveyView) -> None:
     state = reported(view, fix_at(view.points[0], 0.001))
-    assert state["laser"] == {"dop": 1.0, "residual_um": 1.0, "channels": [1, 2, 3, 4], "is_used": True}
+    assert state["laser"] == {"dop": 1.0, "residual_um": 1.0, "channels": [1, 2, 3, 4], "is_used": True, "age_s": 0.0}
     cfg = config_of(health__battery_reserve=0.31, etalon__max_dop=17.0, mission__arrival_tolerance_m=0.012)
     ground = survey_ground(MIRROR, cfg, is_sim=True)
     assert (ground["limits"]["charge"], ground["limits"]["dop"]) == (0.31, 17.0)
