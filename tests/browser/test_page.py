@@ -85,7 +85,7 @@ class Operator:
 
     async def until_text(self, where: str, wanted: str) -> None:
         """Wait until the text of an element is this."""
-        await self.until(f"document.querySelector({json.dumps(where)}).textContent", wanted)
+        await self.until(f"document.querySelector({json.dumps(where)})?.textContent", wanted)
 
 
 @asynccontextmanager
