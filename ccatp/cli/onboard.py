@@ -40,8 +40,8 @@ def onboard(
 ) -> int:
     """Run the program on the robot's own computer: link server, low-level control, devices.
 
-    The configuration is that of configs/onboard.toml, or for a robot among beacons (kind = "beacons") that of
-    configs/beacon_onboard.toml. It ends on SIGTERM or Ctrl-C: the wheels brake, the fans stay.
+    Without --config the configuration is that of configs/onboard.toml. The key kind selects another kind of robot. The
+    program ends on SIGTERM or Ctrl-C: the wheels brake, the fans stay.
     """
     ctx.obj = config_file
     if ctx.invoked_subcommand is not None:

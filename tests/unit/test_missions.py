@@ -10,6 +10,7 @@ import pytest
 
 from ccatp.beacons.kind import BEACONS
 from ccatp.missions import BUILT_IN, MissionKind, Part, all_kinds, built_in, find_kind, kind_of
+from ccatp.onboard.kinds import BUILT_IN as ROBOTS
 from ccatp.studies import STUDIES, find_study
 from ccatp.survey.kind import SURVEY
 from tests.support.scenario import config_of, radio_config_of
@@ -55,5 +56,6 @@ def test_only_the_registry_names_the_indoor_robots() -> None:
         text = path.read_text(encoding="utf-8").replace('type: "radio"', "")  # a button of HTML
         if name.parts[0] != "beacons" and (found := OF_THE_SLICE.findall(text)):
             named[str(name)] = len(found)
-    assert named == {"missions.py": 2}  # module and name, in one line
+    assert named == {"missions.py": 2, "onboard/kinds.py": 3}  # module and name, in one line; there the kind as well
     assert sum("beacons" in place for place in BUILT_IN) == 1
+    assert [name for name, place in ROBOTS.items() if "beacons" in place] == ["beacons"]
