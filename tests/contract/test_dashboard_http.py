@@ -20,11 +20,14 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import PointId
 from ccatp.daemon.supervision.process import open_log
 from ccatp.links.channels import format_error, format_ok
+from ccatp.links.topics import TrackMessage, TruthMessage, Turn
 from ccatp.report.dashboard.app import build_app
 from tests.support.page_rig import DEADLINE_S, Rig, mission, page_rig
 from tests.unit.report.dashboard.test_view import parse
+from tests.unit.report.dashboard.test_views import fix_at
 
 FILES = (
     "page.js", "map.js", "plots.js", "commands.js", "alarms.js", "history.js",
@@ -504,7 +507,7 @@ async def test_what_a_page_shows_and_that_its_end_is_not_that_of_the_survey(runt
             await expect(page.locator("#state")).not_to_have_text("connecting")
             rig.tell_alive()
             await expect(page.locator("#state")).to_have_text("driving")
-            await is_laid_out(page)
+            await is_laid_out(page, rig)
             await takes_a_token(page, rig)
         await expect(page.locator("#alarm")).to_contain_text("LINK LOST")
         await expect(page.locator("#alarm-text")).to_have_text("the dashboard has ended; the survey may continue")
@@ -519,7 +522,7 @@ async def takes_a_token(page: Page, rig: Rig) -> None:
     for token, answer in ((rig.token[::-1], "refused: the token is not accepted"), (rig.token, "pause: done")):
         await page.goto(f"http://127.0.0.1:{rig.port}/?token={token}")
         await expect(page).to_have_url(f"http://127.0.0.1:{rig.port}/")
-        rig.tell_alive()
+        rig.tell_alive(turn=Turn(kind="work", offers=("pause", "abort", "stop")))
         await expect(page.locator("#pause")).to_be_enabled()
         await page.locator("#pause").click()
         await expect(page.locator("#answer")).to_contain_text(answer)
@@ -527,11 +530,21 @@ async def takes_a_token(page: Page, rig: Rig) -> None:
     assert [request["cmd"] for request in rig.asked] == ["pause"]
 
 
-async def is_laid_out(page: Page) -> None:
-    """Everything of a survey on a desktop without scrolling."""
-    await expect(page.locator("figcaption:visible")).to_have_count(4)
-    await expect(page.locator("#plot-arrival")).to_have_attribute("data-empty", "")
-    await expect(page.locator("#plot-arrival .uplot")).to_be_hidden()
+async def is_laid_out(page: Page, rig: Rig) -> None:
+    """Everything of a survey on a desktop without scrolling; a plot without values takes no room."""
+    captions = page.locator("figcaption:visible")
+    await expect(captions).to_have_count(0)
+    await expect(page.locator("#no-plots")).to_be_visible()
+    await page.locator("#engineer").check()
+    await expect(captions).to_have_count(1)  # NIS is of every display state
+    await expect(page.locator("#no-plots")).to_be_hidden()
+    times_s = range(4)
+    rows = [(100 * t_s, float(t_s), 1, 2, 0.0, 0.05, 0.0, 0.001) for t_s in times_s]
+    true = [(100 * t_s, float(t_s), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0) for t_s in times_s]
+    rig.main.send("track", TrackMessage(seq=300, t_s=3.0, rows=rows))
+    rig.truth.send("truth", TruthMessage(seq=300, t_s=3.0, rows=true))
+    rig.main.send("fix", fix_at(PointId(1, 2, 7), 0.001))
+    await expect(captions).to_have_count(4)
     await page.set_viewport_size({"width": 1440, "height": 900})
     assert await page.evaluate("document.documentElement.scrollHeight") <= 900
     for part in (".map", "#plot-arrival", "#plot-nis", "#log", "#controls"):

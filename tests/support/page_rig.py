@@ -54,6 +54,7 @@ class Rig:
     token: str
     main: Publisher
     danger: Publisher
+    truth: Publisher
     stop: asyncio.Event
     lines: Sequence[Mapping[str, Any]]
     asked: list[dict[str, Any]] = field(default_factory=list)
@@ -166,8 +167,8 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
     listener = socket.create_server(("127.0.0.1", 0))
     capture, stop = LogCapture(), asyncio.Event()
     log: FilteringBoundLogger = structlog.wrap_logger(None, processors=[capture])
-    main, danger = (Publisher(context, endpoints.of(name)) for name in ("main", "danger"))
-    rig = Rig(listener.getsockname()[1], make_token(folder), main, danger, stop, capture.entries)
+    published = [Publisher(context, endpoints.of(name)) for name in ("main", "danger", "truth")]
+    rig = Rig(listener.getsockname()[1], make_token(folder), *published, stop, capture.entries)
     run = RunContext(cfg, folder, endpoints, is_sim=True)
     page = serve_page(run, listener, stop, log, has_heartbeat=True)
     try:
@@ -189,6 +190,6 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
             stop.set()
             await served
     finally:
-        rig.main.close()
-        rig.danger.close()
+        for publisher in published:
+            publisher.close()
         context.destroy(linger=0)
