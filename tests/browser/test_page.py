@@ -168,6 +168,35 @@ async def test_the_line_says_whose_turn_it_is_and_has_the_one_button_that_is_acc
     await expect(operator.page.locator("#age")).to_contain_text("no daemon answers")
 
 
+async def test_the_commands_do_not_move_while_one_is_pressed_and_a_double_click_is_one(operator: Operator) -> None:
+    place = "JSON.stringify(document.querySelector('#abort').getBoundingClientRect())"
+    offers = ("pause", "abort", "stop")
+    operator.status = {"turn": Turn(kind="work", offers=offers)}
+    await operator.until("document.querySelector('#abort').disabled", False)
+    before = await operator.page.evaluate(place)
+    await operator.page.locator("#abort").click()
+    await operator.until_text("#abort", "Confirm?")
+    await operator.page.wait_for_selector("#alarm:not([hidden])")  # nothing is heard of the loops meanwhile
+    assert await operator.page.evaluate(place) == before
+    assert operator.rig.asked == []
+    await operator.page.locator("#abort").click()
+    await operator.until_text("#answer", "abort: done")
+    assert [one["cmd"] for one in operator.rig.asked] == ["abort"]
+    operator.status = held("paused", "operator", "resume", OPERATOR.cause(by="eva"), "resume", *offers)
+    await operator.until("document.querySelector('#act').hidden", False)
+    assert await operator.page.evaluate(place) == before
+    box = await operator.page.locator("#abort").bounding_box()
+    assert box is not None
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    await operator.page.mouse.click(*middle)
+    await operator.page.wait_for_timeout(450)  # as long as a slow double click takes
+    await operator.page.mouse.move(*middle)
+    await operator.page.mouse.down(click_count=2)
+    await operator.page.mouse.up(click_count=2)
+    await operator.until_text("#abort", "Confirm?")
+    assert len(operator.rig.asked) == 1
+
+
 async def test_after_the_end_alarms_stay_and_nothing_is_offered(operator: Operator) -> None:
     why = ENCODERS_STALE.cause()
     operator.status = {

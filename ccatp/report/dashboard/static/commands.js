@@ -1,6 +1,6 @@
 // Commands and the daemon's answers: pause, resume, abort in two steps, stop. All of them need a token.
 const ARMED_MS = 5000;
-// A double click is one command.
+// A double click is one command: as the browser counts clicks, and, of two devices, by the times when they were pressed.
 const SETTLE_MS = 350;
 const NAMES = ["pause", "resume", "abort", "stop", "emergency"];
 const KEPT = "ccatp-token";
@@ -14,7 +14,7 @@ export class Commands {
     this.sensible = {};
     this.offers = [];
     for (const name of ["pause", "resume", "stop"]) $(name).onclick = () => this.send(name);
-    $("abort").onclick = () => (this.armedAt === null ? this.arm() : this.confirm());
+    $("abort").onclick = (event) => (this.armedAt === null ? this.arm(event.timeStamp) : this.confirm(event));
     $("abort").addEventListener("blur", () => this.disarm());
     $("token").onchange = () => this.keep($("token").value.trim());
     const given = new URLSearchParams(location.search).get("token");
@@ -67,10 +67,11 @@ export class Commands {
     if (!$(name).disabled) this.send(name);
   }
 
-  arm() {
+  // ``at``: when it was pressed, by the event; a busy page handles it later.
+  arm(at) {
     const button = $("abort");
     if (button.disabled) return;
-    this.armedAt = performance.now();
+    this.armedAt = at;
     button.classList.add("armed");
     button.textContent = "Confirm?";
     button.focus();
@@ -79,8 +80,8 @@ export class Commands {
     this.timer = setTimeout(() => this.disarm(), ARMED_MS);
   }
 
-  confirm() {
-    if (performance.now() - this.armedAt < SETTLE_MS) return;
+  confirm({ detail, timeStamp }) {
+    if (detail > 1 || timeStamp - this.armedAt < SETTLE_MS) return;
     this.disarm();
     this.send("abort");
   }
