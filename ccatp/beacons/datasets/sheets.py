@@ -150,8 +150,8 @@ def read_levels(path: Path, sheet: str | None = None, points: Path | None = None
     if path.is_dir():
         return _read_logs(path, sheet, points)
     table = read_sheet(path, sheet)
-    level = table.column(_LEVEL, "levels, as rssi_dbm")
-    numbers = np.array(table.numbers(table.column(_DISTANCE, _DISTANCES), level, may_lack=(level,)))
+    distance, level = table.column(_DISTANCE, _DISTANCES), table.column(_LEVEL, "levels, as rssi_dbm")
+    numbers = np.array(table.numbers(distance, level, may_lack=(level,)))
     levels, warnings = _heard(numbers[:, 1:])
     rows = zip(numbers[:, 0].tolist(), levels[:, 0].tolist(), strict=True)
     return table.name, tuple(LevelPair(r_m, z) for r_m, z in rows if not np.isnan(z)), warnings
