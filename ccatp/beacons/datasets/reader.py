@@ -1,5 +1,7 @@
 """Reads a recorded run of any format: detects the format, rejects impossible values, and warns of suspicious ones."""
 
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from ccatp.beacons.datasets.assembly import checked_run
@@ -17,7 +19,7 @@ from ccatp.beacons.datasets.formats import (
 from ccatp.beacons.datasets.pyfg import is_pyfg, read_pyfg
 from ccatp.beacons.datasets.ros_bags import SUFFIXES as BAGS
 from ccatp.beacons.datasets.ros_bags import read_bag
-from ccatp.beacons.datasets.tables import RadioDataError, content_lines, read_text
+from ccatp.beacons.datasets.tables import NotTextError, RadioDataError, content_lines, read_text
 from ccatp.beacons.estimation.recording import RecordedRun
 
 TEXTS = (".txt", ".csv", ".tsv")
@@ -65,16 +67,14 @@ def found_format(path: Path, given: str | None = None) -> str:
         return "bag"
     if robots_in(path) if is_folder else ROBOT_FILE.search(path.name):
         return "mrclam"
-    texts = {
-        file: read_text(file) for file in files if not is_plaza(file) and (not is_folder or {*TEXTS} & {*file.suffixes})
-    }
-    if any(is_labyrinth(text) for text in texts.values()):
+    texts = _texts_beside_others(files) if is_folder else [] if is_plaza(path) else [read_text(path)]
+    if any(is_labyrinth(text) for text in texts):
         return "labyrinth"
     if is_plaza(path):
         return "plaza"
-    if any(is_columns(text) for text in texts.values()):
+    if any(is_columns(text) for text in texts):
         return "columns"
-    for text in () if is_folder else texts.values():
+    for text in () if is_folder else texts:
         if not content_lines(text):
             raise RadioDataError(path, "is empty: no line but comments; give a recording")
         if is_events_csv(text):
@@ -84,3 +84,13 @@ def found_format(path: Path, given: str | None = None) -> str:
     raise RadioDataError(
         path, f"none of the formats {', '.join(FORMATS)}; if it is one, name it with --format; see docs/radio_data.md"
     )
+
+
+def _texts_beside_others(files: Sequence[Path]) -> list[str]:
+    """The texts of a folder; other files in it do not tell its format."""
+    texts = []
+    for file in files:
+        if not is_plaza(file) and {*TEXTS} & {*file.suffixes}:
+            with suppress(NotTextError):
+                texts.append(read_text(file))
+    return texts

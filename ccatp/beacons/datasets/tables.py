@@ -25,6 +25,10 @@ class RadioDataError(CcatpError):
         super().__init__(f"{where}:{line}: {problem}" if line is not None else f"{where}: {problem}")
 
 
+class NotTextError(RadioDataError):
+    """A file that is not text."""
+
+
 MOST_DATA_BYTES = 50_000_000  # against decompression bombs; the longest known recording has 10 MB
 LONGEST_ROW = 20_000  # characters
 GZIP_MAGIC = b"\x1f\x8b"
@@ -61,7 +65,7 @@ def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam
     except (OSError, EOFError, zlib.error) as error:
         raise RadioDataError(file, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except UnicodeDecodeError as error:
-        raise RadioDataError(file, f"is not text; give {wanted}") from error
+        raise NotTextError(file, f"is not text; give {wanted}") from error
     for line, content in enumerate(text.splitlines(), 1):
         if len(content) > LONGEST_ROW:
             raise RadioDataError(
