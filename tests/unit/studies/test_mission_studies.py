@@ -246,6 +246,7 @@ def test_late_estimates_meet_their_truth_across_batches() -> None:
         if seq >= DELAY:
             trace.note_estimate(seq - DELAY, 0.01 * (seq - DELAY), parts.mirror.base_panel_pose)
     assert tuple(trace.truth_at(FRAMES - 1 - DELAY)) == true_row(FRAMES - 1 - DELAY)
+    trace.builder.set_counts(measured=1, skipped=0)  # without a point there is no figure of the localization
     track, summary = trace.join(), trace.builder.build()
     assert track[:, 0] == pytest.approx(0.01 * np.arange(FRAMES - DELAY))
     assert track[:, 1] - track[:, 4] == pytest.approx(1e-5 * np.arange(FRAMES - DELAY), abs=1e-12)  # rounding
@@ -372,6 +373,7 @@ RUNS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "recordings": (
         ("data=Plaza2,XBee scenario 1", "estimator=ekf-slam,fingerprints"), ("--data", str(RECORDINGS)), "recordings",
     ),
+    "traits": (("traits=plain", "estimator=ekf-slam"), (), ""),
     "damage": (("damage=5 % ranges of 0 m",), ("--data", str(RECORDINGS)), ""),
     "mote-navigation": ((), ("--set", "mission.laps=1"), "mote_navigation"),
     "radio-signals": (("condition=white 2 dB",), (), "radio_signals"),
@@ -431,6 +433,7 @@ def test_cells_are_configurations_of_their_own(name: str) -> None:
         "faults",
         "recordings",
         "damage",
+        "traits",
     }:  # their jobs look at the factors
         assert len(set(configurations)) == len(configurations)
     assert len({str(cell.factors) for cell in cells}) == len(cells)
