@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
@@ -228,3 +228,11 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
             make(folder)
             (folder / "is_whole").touch()
     return folder
+
+
+def figures_of(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """What a run and its rehearsal in one process have in common of ``summary.json``.
+
+    ``wall`` is of the machine; ``ended`` (alarms, operators, exit status) is of the supervisor, whom no rehearsal has.
+    """
+    return {name: value for name, value in summary.items() if name not in ("wall", "ended")}
