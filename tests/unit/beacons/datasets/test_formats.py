@@ -10,7 +10,7 @@ import pytest
 import scipy.io
 
 from ccatp.beacons.datasets.events import EVENTS
-from ccatp.beacons.datasets.reader import read_run
+from ccatp.beacons.datasets.reader import found_format, read_run
 from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.datasets.trajectory import LOST_RAD, bridged
 from ccatp.beacons.estimation.recording import RecordedRun, Steps, dead_reckoned
@@ -304,6 +304,14 @@ def _two_labyrinths(folder: Path) -> Path:
     for name in ("a.txt", "b.txt"):
         write_lines(folder / name, labyrinth_lines(W_SHORT))
     return folder
+
+
+def test_a_file_that_is_not_text_does_not_hide_the_format_of_its_folder(tmp_path: Path) -> None:
+    write_lines(tmp_path / "a_0.txt", labyrinth_lines(W_SHORT))
+    (tmp_path / "0.csv").write_bytes(b"\xff\xfe\x00\x81")
+    assert found_format(tmp_path) == "labyrinth"
+    with pytest.raises(RadioDataError, match="is not text"):
+        found_format(tmp_path / "0.csv")
 
 
 def _folder(folder: Path) -> Path:
