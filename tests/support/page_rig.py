@@ -167,8 +167,8 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
     listener = socket.create_server(("127.0.0.1", 0))
     capture, stop = LogCapture(), asyncio.Event()
     log: FilteringBoundLogger = structlog.wrap_logger(None, processors=[capture])
-    published = [Publisher(context, endpoints.of(name)) for name in ("main", "danger", "truth")]
-    rig = Rig(listener.getsockname()[1], make_token(folder), *published, stop, capture.entries)
+    main, danger, truth = (Publisher(context, endpoints.of(name)) for name in ("main", "danger", "truth"))
+    rig = Rig(listener.getsockname()[1], make_token(folder), main, danger, truth, stop, capture.entries)
     run = RunContext(cfg, folder, endpoints, is_sim=True)
     page = serve_page(run, listener, stop, log, has_heartbeat=True)
     try:
@@ -190,6 +190,6 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
             stop.set()
             await served
     finally:
-        for publisher in published:
+        for publisher in (main, danger, truth):
             publisher.close()
         context.destroy(linger=0)
