@@ -240,13 +240,13 @@ def working(what: str) -> Iterator[None]:
         if line:
             click.echo(f"\r{' ' * len(line)}\r", nl=False, err=True)
 
-    teller = Thread(target=tell, daemon=True)
-    teller.start()
+    thread = Thread(target=tell, daemon=True)
+    thread.start()
     try:
         yield
     finally:
         is_done.set()
-        teller.join()
+        thread.join()
 
 
 def print_lines(lines: Iterable[str]) -> None:

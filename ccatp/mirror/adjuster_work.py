@@ -106,7 +106,7 @@ def check_moves(
 ) -> tuple[MoveCheck, ...]:
     """Moves planned by the survey ``before``, and the change of the panels at their adjusters that ``after`` shows.
 
-    Five adjusters can be told apart from nine points: the change has twist and bowl. ``errors``: those of the errors
+    Five adjusters can be distinguished with nine points: the change has twist and bowl. ``errors``: those of the errors
     common to the panels of a survey that differ between the surveys.
     """
     found = []

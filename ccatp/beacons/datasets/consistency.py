@@ -1,4 +1,4 @@
-"""Units and clocks told by the run itself: readings against the shape of the odometry, and the truth against it."""
+"""Units and clocks from the run itself: readings against the shape of the odometry, and the truth against it."""
 
 from collections.abc import Callable, Iterator
 

@@ -228,12 +228,12 @@ class Window:
         variances = np.diag(solved.factored.shared_covariance())
         wide = list[str]()
         for at, k in enumerate(shared):
-            told = 1.0 / variances[at] - problem.assumed_information[k]
+            information = 1.0 / variances[at] - problem.assumed_information[k]
             sigma = float(getattr(self._wide, SHARED[k]))
-            if told * sigma * sigma < 1.0:
+            if information * sigma * sigma < 1.0:
                 continue
-            z = float(solved.state.shared[k]) / float(variances[at] * told)
-            spreads = np.array((sigma, NARROW * sigma)) ** 2 + 1.0 / told
+            z = float(solved.state.shared[k]) / float(variances[at] * information)
+            spreads = np.array((sigma, NARROW * sigma)) ** 2 + 1.0 / information
             whole, little = (-0.5 * (np.log(spreads) + z * z / spreads)).tolist()
             if whole > little + SURE:
                 wide.append(SHARED[k])

@@ -120,7 +120,7 @@ def _odometry(motion: _Motion, rng: np.random.Generator, traits: Collection[str]
     way, side, turn = added(motion.distance_m), added(motion.lateral_m), added(motion.turn_rad)
     noise = rng.standard_normal((4, len(starts)))
     travelled = np.hypot(way, side)
-    told = [
+    measured = [
         added(motion.distance_m * scale) + 0.015 * np.sqrt(travelled) * noise[0],
         added(motion.turn_rad) * (1.0 + turn_scale)
         + bias_rad_s * every * FINE_S
@@ -129,11 +129,11 @@ def _odometry(motion: _Motion, rng: np.random.Generator, traits: Collection[str]
         added(motion.lateral_m * scale) + (0.01 * np.sqrt(travelled) * noise[3] if side.any() else 0.0),
     ]
     if "rates" in traits:
-        told = [
+        measured = [
             np.diff(tick * np.floor(running_total(one) / tick))
-            for one, tick in zip(told, (_TICK_M, _TICK_RAD, _TICK_M), strict=True)
+            for one, tick in zip(measured, (_TICK_M, _TICK_RAD, _TICK_M), strict=True)
         ]
-    return Steps(np.append(motion.times_s[starts], motion.times_s[-1]), *told)
+    return Steps(np.append(motion.times_s[starts], motion.times_s[-1]), *measured)
 
 
 def _placed(room_m: FloatArray, rng: np.random.Generator, traits: Collection[str]) -> FloatArray:
@@ -177,9 +177,9 @@ def _ranges(motion: _Motion, places_m: FloatArray, rng: np.random.Generator, tra
     if "outliers" in traits:
         wrong = rng.random(m) < _OUTLIERS
         error[wrong] += rng.uniform(-_OUTLYING_M, _OUTLYING_M, int(wrong.sum()))
-    told = np.maximum((1.0 + scale) * range_m + offset_m + error, 0.01)
+    measured = np.maximum((1.0 + scale) * range_m + offset_m + error, 0.01)
     nothing = np.full(m, np.nan)
-    return Readings(times_s, beacon, told, nothing, nothing.copy())
+    return Readings(times_s, beacon, measured, nothing, nothing.copy())
 
 
 def _lasting(times_s: FloatArray, sigma: float, lasts_s: float, rng: np.random.Generator) -> FloatArray:

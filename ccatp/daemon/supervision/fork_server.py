@@ -24,7 +24,7 @@ from ccatp.links.service_manager import VARIABLES
 
 MODULE = "ccatp.daemon.supervision.fork_server"
 # What every process of every mission imports; nothing of a mission, nothing that the danger rules must not import, and
-# no state of random numbers but that of ``random``, which a fork seeds anew.
+# no state of random numbers but that of ``random``, which a fork seeds again.
 PRELOADED = ("ccatp.daemon.supervision.process", "ccatp.links.topics", "numpy", "uvloop", "zmq.asyncio")
 # Environment variable with the supervisor's process number, for its children.
 SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"

@@ -251,7 +251,6 @@ export class Plots {
     const { columns, unit } = LOOKS[name];
     const row = (index === null ? null : rows[index]) ?? rows.at(-1);
     const place = this.places[name];
-    place.toggleAttribute("data-empty", !rows.length);
     const keys = place.closest("figure").querySelectorAll(".key b");
     const suffix = ` ${unit}`;
     columns.forEach(({ label }, k) => {

@@ -34,10 +34,10 @@ def measures(run: RecordedRun) -> dict[str, float]:
     assert run.truth is not None
     path = np.column_stack(run.truth[1:3])
     driven = float(np.hypot(*np.diff(path, axis=0).T).sum())
-    told = float(np.hypot(run.steps.distance_m, run.steps.lateral_m).sum())
+    measured = float(np.hypot(run.steps.distance_m, run.steps.lateral_m).sum())
     return {
         "correlated": lasting(run),
-        "scale": abs(told / driven - 1.0),
+        "scale": abs(measured / driven - 1.0),
         "outliers": float(np.abs(off).max()),
         "lateral": float(np.abs(run.steps.lateral_m).sum()),
         "heights": float(np.median(off)),
