@@ -99,5 +99,5 @@ def test_labyrinth_smoothed() -> None:
     assert found.trajectory_rmse_m is not None
     assert found.trajectory_rmse_m < 0.065
     reported = " | ".join(run.warnings)
-    assert "wheel columns by the shape of the true path: left, right, track 0.15" in reported
+    assert "wheel columns are read as left, right and half the track of 0.157 m" in reported
     assert "ranges read +5.0 per cent" in reported
