@@ -1,7 +1,11 @@
 """The figures of ``make metrics``, on a package whose figures are counted by hand."""
 
+import sys
 from pathlib import Path
 
+import pytest
+
+from tools.metrics.frame_profile import measure, profile
 from tools.metrics.sizes import duplicate_classes, read_sources, single_importer_modules
 
 A = '''"""Docstring."""
@@ -39,3 +43,20 @@ def test_lines_names_and_imports_are_counted(tmp_path: Path) -> None:
     assert sum(one.functions for one in sources.values()) == 2
     assert duplicate_classes(sources.values()) == ["Same"]
     assert single_importer_modules(sources.values()) == ["p", "p.b"]  # p.c has two importers, p.a has none
+
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.slow
+def test_the_calls_of_a_frame_are_counted_in_the_main_loop() -> None:
+    counted = measure(ROOT, Path(sys.executable))
+    assert 10 < counted.files < counted.calls <= counted.all_calls
+    assert counted.files <= counted.all_files
+
+
+@pytest.mark.slow
+def test_each_process_of_a_run_is_sampled() -> None:
+    names = {one.name: one.rows.total() for one in profile(ROOT, 1)}
+    assert {"daemon.loops.main_loop", "daemon.loops.danger_loop"} <= names.keys()
+    assert all(us > 0.0 for us in names.values())

@@ -2,14 +2,14 @@
 
 CCATP_PROFILE names the folder that takes the samples of the processes, CCATP_FRAME_PACKAGE the folder of the package. A
 timer of CPU time interrupts the main thread: unlike a tracing profiler it costs a call no more than it takes. Each
-sample weighs the CPU time of the main thread since the one before, so that they add up to it.
+sample weighs the CPU time of the main thread since the one before, so that they add up to it. A fork of a process begins
+its own samples: it inherits neither the timer nor the CPU time.
 """
 
 import atexit
 import json
 import os
 import signal
-import sys
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -25,12 +25,20 @@ _FIRST = "data_received"
 class _Samples:
     """CPU time of the main thread by (function of the package, innermost function), s."""
 
-    def __init__(self, package: str, path: Path) -> None:
-        self._package, self._path = package, path
+    def __init__(self, package: str, folder: Path) -> None:
+        self._package, self._folder = package, folder
         self._times_s: defaultdict[tuple[str, str], float] = defaultdict(float)
+        self.begin()
+
+    def begin(self) -> None:
+        """Take samples of this process from now on."""
+        self._times_s.clear()
         self._thread_s = time.thread_time()
         self._others_s = time.process_time() - self._thread_s
         self._has_begun = False
+        signal.signal(signal.SIGPROF, self)
+        signal.siginterrupt(signal.SIGPROF, False)
+        signal.setitimer(signal.ITIMER_PROF, _PERIOD_S, _PERIOD_S)
 
     def __call__(self, _number: int, frame: FrameType | None) -> None:
         now_s = time.thread_time()
@@ -52,10 +60,12 @@ class _Samples:
     def write(self) -> None:
         """Write name of the process, CPU time of its other threads, s, and rows of function, innermost function, s."""
         signal.setitimer(signal.ITIMER_PROF, 0.0)
-        words = [word for word in sys.orig_argv if word.startswith("ccatp")]
+        line = Path("/proc/self/cmdline").read_text(encoding="utf-8", errors="replace")
+        words = [word for word in line.split("\0") if word.startswith("ccatp")]
         others_s = time.process_time() - time.thread_time() - self._others_s
         rows = [[*names, time_s] for names, time_s in self._times_s.items()]
-        self._path.write_text(json.dumps([words[0] if words else "", others_s, rows]), encoding="utf-8")
+        path = self._folder / f"{os.getpid()}.json"
+        path.write_text(json.dumps([words[0] if words else "", others_s, rows]), encoding="utf-8")
 
 
 def _name(path: str, function: str) -> str:
@@ -66,11 +76,9 @@ def _begin() -> None:
     folder = os.environ.get("CCATP_PROFILE")
     if folder is None:
         return
-    samples = _Samples(os.environ["CCATP_FRAME_PACKAGE"], Path(folder) / f"{os.getpid()}.json")
+    samples = _Samples(os.environ["CCATP_FRAME_PACKAGE"], Path(folder))
     atexit.register(samples.write)
-    signal.signal(signal.SIGPROF, samples)
-    signal.siginterrupt(signal.SIGPROF, False)
-    signal.setitimer(signal.ITIMER_PROF, _PERIOD_S, _PERIOD_S)
+    os.register_at_fork(after_in_child=samples.begin)
 
 
 _begin()
