@@ -19,7 +19,7 @@ import numpy as np
 
 from ccatp.config.files import read_key
 from ccatp.config.load import load_onboard_config
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.config.models import Config
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.core import DeckPose
@@ -202,7 +202,7 @@ class SimOutlets(NamedTuple):
 
 
 async def serve(
-    cfg: MissionConfig,
+    cfg: CommonConfig,
     options: StandInOptions,
     *,
     lockstep: bool,

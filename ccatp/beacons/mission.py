@@ -15,7 +15,7 @@ from ccatp.conditions import Action
 from ccatp.core import NO_CAUSE, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
-from ccatp.survey.engagement import EngagedMission, Engagement, EngagementRules, Event, Row, enter
+from ccatp.survey.engagement import EngagedMission, Engagement, EngagementRules, Event, Reaction, enter
 from ccatp.survey.events import (
     DONE,
     HELD,
@@ -43,7 +43,7 @@ class BeaconRules(EngagementRules[Engagement]):
 
     rows = (
         *(ON_EARTHQUAKE, ON_FAULT, ON_UNKNOWN, ON_HOLD, ON_NO_VERDICT),
-        Row("nothing is permitted", Action.PAUSE, lambda _, v: is_denied(v), stand),
+        Reaction("nothing is permitted", Action.PAUSE, lambda _, v: is_denied(v), stand),
         ON_EMERGENCY,
     )
 

@@ -10,7 +10,7 @@ from typing import Any
 from ccatp.config.files import read_toml
 from ccatp.config.load import DEFAULT_FILE, available, load_config, load_mission
 from ccatp.config.messages import format_value
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.config.models import FOUR_STATE, Config
 from ccatp.config.package import configs_dir
 from ccatp.missions import kind_of
@@ -87,14 +87,14 @@ def shipped_config(cfg: Config) -> Config:
     return load_config(None, shipped).model_copy(update={"run": load_config().run})
 
 
-def differences(cfg: MissionConfig, other: MissionConfig | None = None) -> list[tuple[str, object, object]]:
+def differences(cfg: CommonConfig, other: CommonConfig | None = None) -> list[tuple[str, object, object]]:
     """Dotted key, value in ``other``, and value in ``cfg``; None where there is none.
 
     Without ``other`` the shipped configuration that is nearest, as of the same mirror and world.
     """
     if other is None:
         kind = kind_of(cfg)
-        shipped: Callable[[Any], MissionConfig] | None = None if kind.shipped is None else kind.shipped.get()
+        shipped: Callable[[Any], CommonConfig] | None = None if kind.shipped is None else kind.shipped.get()
         other = load_mission(None, {"system": cfg.system}) if shipped is None else shipped(cfg)
     before, after = dict(_leaves(other.model_dump(mode="json"))), dict(_leaves(cfg.model_dump(mode="json")))
     keys = dict.fromkeys((*before, *after))

@@ -24,7 +24,7 @@ from ccatp.config.messages import (
     format_value,
     parse_toml,
 )
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.config.package import configs_dir
@@ -243,7 +243,7 @@ def load_config(file: Path | None = None, overrides: Overrides = None, *, any_po
     return validated(Config, tree, sources, check_config)
 
 
-def dump_config(cfg: MissionConfig) -> str:
+def dump_config(cfg: CommonConfig) -> str:
     """The complete configuration as TOML; the loader of its kind gives an equal one."""
     import tomlkit  # noqa: PLC0415 - only a command that writes a file needs it, and every process reads one
 
@@ -327,10 +327,10 @@ def kind_in(file: Path | None, overrides: Overrides = None) -> MissionKind:
     return kind
 
 
-def load_mission(file: Path | None = None, overrides: Overrides = None, *, any_ports: bool = False) -> MissionConfig:
+def load_mission(file: Path | None = None, overrides: Overrides = None, *, any_ports: bool = False) -> CommonConfig:
     """The configuration of any kind of mission; arguments and errors as of ``load_config`` and ``kind_in``."""
     load: LoadConfig = kind_in(file, overrides).load.get()
-    cfg: MissionConfig = load(file, overrides, any_ports=any_ports)
+    cfg: CommonConfig = load(file, overrides, any_ports=any_ports)
     return cfg
 
 

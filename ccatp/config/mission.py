@@ -29,7 +29,7 @@ class DangerSection(Protocol):
         """Age of a frame from which no permit is given on it."""
 
 
-class MissionConfig(Protocol):
+class CommonConfig(Protocol):
     """A configuration. Each server that ``sim`` has a section for is stood in for by ``ccatp run --sim``."""
 
     @property

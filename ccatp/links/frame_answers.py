@@ -17,7 +17,7 @@ MAX_DRIFT = 1.02e-2
 AWAY_SLACK_S = 1.0
 
 
-class FrameId(NamedTuple):
+class FrameStamp(NamedTuple):
     """Identity of a frame for one client: boot number, the client's own count of sessions, number and robot time."""
 
     boot: int
@@ -26,7 +26,7 @@ class FrameId(NamedTuple):
     t_s: float
 
 
-def is_restart(before: FrameId, first: FrameId, away_s: float = 0.0) -> bool:
+def is_restart(before: FrameStamp, first: FrameStamp, away_s: float = 0.0) -> bool:
     """Whether the robot restarted between the newest frame of the sessions ``before`` and the ``first`` of the next.
 
     The boot number alone does not tell, because firmware may have no counter in its flash. Numbers and time count
@@ -74,11 +74,11 @@ class DriveRule:
 class JudgedFrame:
     """A frame that danger has judged, and the verdict on it. Only from this a permit of motion is made."""
 
-    frame: FrameId
+    frame: FrameStamp
     verdict: Verdict
 
 
-def permitted(newest: FrameId | None, judged: JudgedFrame | None) -> Permits:
+def permitted(newest: FrameStamp | None, judged: JudgedFrame | None) -> Permits:
     """The motion permitted on the newest frame: that of its own verdict, otherwise none."""
     if judged is None or judged.frame != newest:
         return NO_MOTION
@@ -99,14 +99,14 @@ class PermitRule:
 
     def begin_session(self) -> None:
         """Forget frame and verdict of the session before; the numbers continue."""
-        self._newest: FrameId | None = None
+        self._newest: FrameStamp | None = None
         self._judged: JudgedFrame | None = None
 
     def restart(self) -> None:
         """Begin again, because the robot's frame numbers have restarted."""
         self._highest_seq = -1
 
-    def take(self, frame: FrameId) -> bool:
+    def take(self, frame: FrameStamp) -> bool:
         """Take a frame of the session; whether it is to be judged."""
         newest = self._newest
         if newest is not None and frame.seq <= newest.seq:

@@ -44,7 +44,7 @@ class Controlled(NamedTuple):
     loop_hz: float
 
 
-class RobotConfig(Protocol):
+class OnboardRobotConfig(Protocol):
     """What the configurations of all kinds have."""
 
     @property
@@ -64,12 +64,12 @@ class RobotKind:
     make_robot: Part  # Callable[[C, RobotHardware], Controlled]
     no_tuning: str = ""
 
-    def hardware(self, cfg: RobotConfig, clock: Callable[[], float]) -> RobotHardware:
+    def hardware(self, cfg: OnboardRobotConfig, clock: Callable[[], float]) -> RobotHardware:
         """The devices, not opened yet."""
         made: RobotHardware = self.make_hardware.get()(cfg, clock)
         return made
 
-    def robot(self, cfg: RobotConfig, hardware: RobotHardware) -> Controlled:
+    def robot(self, cfg: OnboardRobotConfig, hardware: RobotHardware) -> Controlled:
         """The robot on started hardware."""
         made: Controlled = self.make_robot.get()(cfg, hardware)
         return made
@@ -95,8 +95,8 @@ def kind_in(file: Path | None, overrides: Overrides = None) -> RobotKind:
     return kind
 
 
-def load_robot_config(file: Path | None, overrides: Overrides = None) -> tuple[RobotKind, RobotConfig]:
+def load_robot_config(file: Path | None, overrides: Overrides = None) -> tuple[RobotKind, OnboardRobotConfig]:
     """The kind of a configuration, and the configuration. Raises ConfigError."""
     kind = kind_in(file, overrides)
-    cfg: RobotConfig = kind.load.get()(file, overrides)
+    cfg: OnboardRobotConfig = kind.load.get()(file, overrides)
     return kind, cfg

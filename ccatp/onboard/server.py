@@ -6,7 +6,7 @@ from typing import cast
 
 from ccatp.links.robot_link import LineWriter
 from ccatp.onboard.rules import LinkedRobot
-from ccatp.onboard.sessions import RobotServer, RobotSession, ServerLog
+from ccatp.onboard.sessions import ClientSession, RobotServer, ServerLog
 
 HOUSEKEEPING_S = 0.25
 # While more than this is unsent to a client that does not read, further frames for it are dropped.
@@ -88,7 +88,7 @@ class TcpRobotServer(RobotServer):
         self._start_timer()
 
 
-class Connection(RobotSession, asyncio.Protocol):
+class Connection(ClientSession, asyncio.Protocol):
     """One client of a ``TcpRobotServer``."""
 
     _transport: asyncio.Transport

@@ -62,7 +62,7 @@ class ServerLog(Protocol):
         """Log one line with its fields."""
 
 
-class RobotSession(ABC):
+class ClientSession(ABC):
     """One client; a transport adds the sending of bytes.
 
     Attributes:
@@ -135,8 +135,8 @@ class RobotServer:
         self.each_frame: list[Callable[[], object]] = []
         self._is_lockstep, self._key, self._log = lockstep, key, log
         self._boot = secrets.randbits(31)
-        self._sessions: set[RobotSession] = set()
-        self._holders: dict[Role, RobotSession] = {}
+        self._sessions: set[ClientSession] = set()
+        self._holders: dict[Role, ClientSession] = {}
         self._last_session = 0
         self._acked: set[Role] = set()  # roles that have answered the newest frame
         self._is_stall_noted = False
@@ -146,7 +146,7 @@ class RobotServer:
         """Start the robot's clock at ``now_s``."""
         self._boot_s = self._frame_wall_s = self._repeated_s = now_s
 
-    def accept(self, session: RobotSession, now_s: float) -> None:
+    def accept(self, session: ClientSession, now_s: float) -> None:
         """Send the hello to a client that has connected; refuse it when there are too many sessions."""
         session.joined_s = session.received_s = now_s
         auth, boot = AUTH_NONE if self._key is None else AUTH_HMAC, self._boot + self.robot.boot_count
@@ -155,7 +155,7 @@ class RobotServer:
         if len(self._sessions) > MAX_SESSIONS:
             self.refuse(session, "busy")
 
-    def lost(self, session: RobotSession) -> None:
+    def lost(self, session: ClientSession) -> None:
         """Remove a session whose connection is lost or will be closed: free its role and hold the wheels."""
         session.is_open = False
         self._sessions.discard(session)
@@ -167,13 +167,13 @@ class RobotServer:
         self._acked.discard(role)
         self._note(f"{role} lost: wheels held")
 
-    def drop(self, session: RobotSession, why: str) -> None:
+    def drop(self, session: ClientSession, why: str) -> None:
         """Close a session."""
         self._note(f"{session.role or 'client'} dropped: {why}")
         self.lost(session)
         session.close()
 
-    def refuse(self, session: RobotSession, reason: RefusalReason) -> None:
+    def refuse(self, session: ClientSession, reason: RefusalReason) -> None:
         """Refuse a role to a client and close its session."""
         self.counts["refused"] += 1
         session.write(encode(Refused(reason=reason)))
@@ -198,7 +198,7 @@ class RobotServer:
             missing = "permit" if "controller" in self._acked else "drive"
             self._note(f"stall: frame {self.robot.delivered_seq} waits for its {missing}")
 
-    def join(self, session: RobotSession, message: FromClient, now_s: float) -> None:
+    def join(self, session: ClientSession, message: FromClient, now_s: float) -> None:
         """Handle the first message of a session that has no role yet."""
         # `check_time` may run after this message, so the time limit is also checked here.
         if not isinstance(message, Join) or now_s - session.joined_s > JOIN_TIMEOUT_S:
@@ -241,7 +241,7 @@ class RobotServer:
                 return
             self._drive_frame()
 
-    def command(self, session: RobotSession, role: Role, message: FromClient, now_s: float) -> bool:
+    def command(self, session: ClientSession, role: Role, message: FromClient, now_s: float) -> bool:
         """Handle a message of a session that has a role; false when the message is not for this role."""
         robot, robot_s = self.robot, self._robot_time_s(now_s)
         if type(message) is Drive and role == "controller":

@@ -257,7 +257,7 @@ def _part_number(path: Path) -> int:
 
 
 @dataclass(slots=True)
-class Condition:
+class FileCondition:
     """Condition of a file, known at the end of a scan; ``lost``: the stretches of bytes without an intact record."""
 
     size_bytes: int = 0
@@ -278,7 +278,7 @@ class Condition:
             self.lost.append((begin, end))
 
 
-def scan(path: Path, condition: Condition) -> Iterator[McapRecord]:
+def scan(path: Path, condition: FileCondition) -> Iterator[McapRecord]:
     """The intact records of a file, chunks broken up. Raises ``OSError`` where it cannot be read.
 
     A chunk has a checksum, so a damaged one is left out. If the lengths are damaged, the next chunk is found by its
@@ -358,7 +358,7 @@ def iter_logged(
     the file cannot be read.
     """
     channels: dict[int, str] = {}
-    condition = Condition()
+    condition = FileCondition()
     has_searched = False
     for record in scan(path, condition):
         if isinstance(record, Channel):
@@ -367,7 +367,7 @@ def iter_logged(
             if record.channel_id not in channels and not has_searched:
                 # The chunk that names it is damaged; the end of a file repeats all names.
                 has_searched = True
-                channels |= {one.id: one.topic for one in scan(path, Condition()) if isinstance(one, Channel)}
+                channels |= {one.id: one.topic for one in scan(path, FileCondition()) if isinstance(one, Channel)}
             if record.channel_id not in channels:
                 continue
             # Up to format 2 both times are the robot's.
@@ -377,7 +377,7 @@ def iter_logged(
         on_damage(_damage(path, condition))
 
 
-def _damage(path: Path, condition: Condition) -> str:
+def _damage(path: Path, condition: FileCondition) -> str:
     """Where a file is damaged, and how much of it is lost."""
     if not condition.lost:
         return f"{path}: damaged or cut off at byte {condition.size_bytes}"
@@ -388,7 +388,7 @@ def _damage(path: Path, condition: Condition) -> str:
 
 def read_metadata(path: Path) -> dict[str, str]:
     """The recorder's metadata; ``simulation`` is ``"true"`` or ``"false"``. Empty if there is none."""
-    for record in scan(path, Condition()):
+    for record in scan(path, FileCondition()):
         if isinstance(record, Metadata) and record.name == _METADATA:
             return dict(record.metadata)
     return {}

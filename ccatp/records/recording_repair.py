@@ -13,7 +13,16 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from ccatp.errors import UsageError
-from ccatp.records.recorder import CHUNK_BYTES, DAMAGE, MAGIC, TELEMETRY, Condition, is_being_written, recordings, scan
+from ccatp.records.recorder import (
+    CHUNK_BYTES,
+    DAMAGE,
+    MAGIC,
+    TELEMETRY,
+    FileCondition,
+    is_being_written,
+    recordings,
+    scan,
+)
 from ccatp.records.timeline import read_timeline
 
 NO_INDEX = "no index: it was not closed"
@@ -74,7 +83,7 @@ class RecordingFacts:
     """
 
     path: Path
-    condition: Condition
+    condition: FileCondition
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     topics: dict[str, TopicFacts] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
@@ -159,7 +168,7 @@ def recording_files(path: Path) -> list[Path]:
 
 def read_facts(path: Path) -> RecordingFacts:
     """Read the content of a recording; raises ``RecordingError`` where it cannot be read or is no recording."""
-    condition = Condition()
+    condition = FileCondition()
     facts = RecordingFacts(path, condition)
     schemas: dict[int, str] = {}
     channels: dict[int, TopicFacts] = {}
@@ -209,7 +218,7 @@ class Saved(NamedTuple):
     path: Path
     messages: int
     end_s: float | None
-    condition: Condition
+    condition: FileCondition
 
 
 def recover(path: Path, out: Path) -> Saved:
@@ -217,7 +226,7 @@ def recover(path: Path, out: Path) -> Saved:
 
     The old file is left as it is. ``RecordingError``: one cannot be read or written, or nothing in it is a recording.
     """
-    condition = Condition()
+    condition = FileCondition()
     try:
         records = list(scan(path, condition))
     except OSError as error:
@@ -262,7 +271,7 @@ def _rewrite(writer: Writer, records: list[McapRecord]) -> list[int]:
     return times_ns
 
 
-def _check_is_recording(path: Path, channels: Sized, condition: Condition) -> None:
+def _check_is_recording(path: Path, channels: Sized, condition: FileCondition) -> None:
     if not channels:
         what = "is empty" if not condition.size_bytes else "holds no intact channel of an MCAP recording"
         raise RecordingError(f"{path}: {what}; nothing can be shown or saved")

@@ -358,7 +358,7 @@ def _readable(path: Path, read: Callable[[Path], _T]) -> _T:
         raise RunReadError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-class Survey(NamedTuple):
+class RecordedSurvey(NamedTuple):
     """A run's survey; ``injected``: simulated misalignment of the panels, None on a real robot or if not recorded."""
 
     cfg: Config
@@ -369,7 +369,7 @@ class Survey(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def read_run(run_dir: Path, overrides: Mapping[str, object]) -> Survey:
+def read_run(run_dir: Path, overrides: Mapping[str, object]) -> RecordedSurvey:
     """Read the survey of a run directory without changing it; ``overrides`` are dotted keys of the configuration.
 
     ``RunReadError``: no such directory, or no run in it, or a database that cannot be read; ``ConfigError``: its
@@ -383,7 +383,7 @@ def read_run(run_dir: Path, overrides: Mapping[str, object]) -> Survey:
         raise RunReadError(str(error)) from error
     warnings = [*stored.warnings]
     injected, is_simulation = read_truth(run_dir, warnings)
-    return Survey(
+    return RecordedSurvey(
         cfg, tuple(row.point for row in stored.points), stored.fixes, injected, is_simulation, tuple(warnings)
     )
 

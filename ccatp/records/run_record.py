@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.links.topics import Message, MissionStatus
 from ccatp.records.recorder import RecordedMessage, RobotClock
 
@@ -52,6 +52,6 @@ class StatusRecord(RunRecord):
         return {**self._run, "wall": {"time_s": round(wall_s, 3)}}
 
 
-def status_record(cfg: MissionConfig, _run_dir: Path, _clock: RobotClock, _is_sim: bool) -> RunRecord:
+def status_record(cfg: CommonConfig, _run_dir: Path, _clock: RobotClock, _is_sim: bool) -> RunRecord:
     """The record of a kind of mission that has none of its own."""
     return StatusRecord(cfg.system, cfg.run.seed)

@@ -97,7 +97,7 @@ class RunFiles:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class RunRecord(RunFiles):
+class SurveyRecord(RunFiles):
     """A survey."""
 
     cfg: Config
@@ -120,7 +120,7 @@ class RunRecord(RunFiles):
         return bool(driven) and all(session.truth is not None for session in driven)
 
 
-def read_record(run_dir: Path) -> RunRecord:
+def read_record(run_dir: Path) -> SurveyRecord:
     """Read the data for the report of a survey.
 
     Raises RunReadError: no such directory, no run in it, or no survey; ConfigError: its configuration cannot be used.
@@ -146,7 +146,7 @@ def read_record(run_dir: Path) -> RunRecord:
         folder.missing.append("the simulated truth: errors are those that the laser saw")
     points, measured = _survey(folder, mirror)
     injected, _ = read_truth(run_dir, folder.warnings)
-    return RunRecord(
+    return SurveyRecord(
         cfg=cfg,
         mirror=mirror,
         sessions=tuple(sessions),
@@ -187,7 +187,7 @@ def changed_keys(
     return found
 
 
-class Recording(NamedTuple):
+class RecordedMessages(NamedTuple):
     """The messages of a recording by topic, on its axis, and its metadata."""
 
     name: str
@@ -237,7 +237,9 @@ class RunFolder:
             self.warnings.append(f"{path.name}: cannot be read: {error}")
         return None
 
-    def recordings(self, topics: Iterable[str], columns: Mapping[str, int], holds: str) -> list[Recording | None]:
+    def recordings(
+        self, topics: Iterable[str], columns: Mapping[str, int], holds: str
+    ) -> list[RecordedMessages | None]:
         """All recordings, without their damaged parts; None in place of an unreadable one.
 
         Messages of topics in ``columns`` are tables and become arrays of shape (k, columns).
@@ -247,7 +249,7 @@ class RunFolder:
             self.missing.append(f"{TELEMETRY}: {holds}")
         return [self._recording(path, topics, columns) for path in paths]
 
-    def _recording(self, path: Path, topics: Iterable[str], columns: Mapping[str, int]) -> Recording | None:
+    def _recording(self, path: Path, topics: Iterable[str], columns: Mapping[str, int]) -> RecordedMessages | None:
         found: dict[str, list[Any]] = {topic: [] for topic in topics}
         lost = list[str]()
         try:
@@ -275,7 +277,7 @@ class RunFolder:
             self.warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are not used: {lost[0]}")
         if (mark := metadata.get("simulation")) is not None:
             self.is_simulation = mark == "true"
-        return Recording(path.name, found, metadata.get("ccatp", "unknown"), timeline)
+        return RecordedMessages(path.name, found, metadata.get("ccatp", "unknown"), timeline)
 
 
 def joined(batches: Sequence[FloatArray], columns: int, needed: int) -> FloatArray:
@@ -288,7 +290,9 @@ def joined(batches: Sequence[FloatArray], columns: int, needed: int) -> FloatArr
 _COLUMNS = {"track": 8, "truth": 11}
 
 
-def _session(found: Recording, mirror: Mirror, changes: Sequence[StateChange], warnings: list[str]) -> RecordedSession:
+def _session(
+    found: RecordedMessages, mirror: Mirror, changes: Sequence[StateChange], warnings: list[str]
+) -> RecordedSession:
     messages = found.messages
     track, truth = (joined(messages[topic], count, count) for topic, count in _COLUMNS.items())
     try:

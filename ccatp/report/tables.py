@@ -65,7 +65,7 @@ _MOVES = {
 }
 
 
-class Table(NamedTuple):
+class ColumnTable(NamedTuple):
     """Columns with their descriptions, and rows by the names of the columns.
 
     A value that is missing in a row or None is not known; values without a column are left out.
@@ -87,7 +87,7 @@ def write_tables(found: Findings, folder: Path) -> None:
         write_file(folder / f"{name}.ecsv", "\n".join([*_ecsv_head(table, metadata), *csv_lines(table), ""]), FILE_MODE)
 
 
-def csv_lines(table: Table) -> Iterator[str]:
+def csv_lines(table: ColumnTable) -> Iterator[str]:
     """The names of the columns, then one line for each row."""
     text = StringIO()
     writer = csv.DictWriter(text, table.columns, extrasaction="ignore", lineterminator="\n")
@@ -96,7 +96,7 @@ def csv_lines(table: Table) -> Iterator[str]:
     yield from text.getvalue().splitlines()
 
 
-def _ecsv_head(table: Table, metadata: Mapping[str, object]) -> Iterator[str]:
+def _ecsv_head(table: ColumnTable, metadata: Mapping[str, object]) -> Iterator[str]:
     yield from ("# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:")
     for name, description in table.columns.items():
         unit = name.rpartition("_")[2]
@@ -113,7 +113,7 @@ def _yaml(value: object) -> str:
     return "".join(char if char.isprintable() else f"\\U{ord(char):08x}" for char in text)
 
 
-def fixes_table(found: Findings) -> Table:
+def fixes_table(found: Findings) -> ColumnTable:
     """Every point of the mission, measured or not."""
     record, alignment = found.record, found.alignment
     fixes = {one.point: one.fix for one in record.measured}
@@ -136,14 +136,14 @@ def fixes_table(found: Findings) -> Table:
             row |= {"deviation_um": one["deviation_um"], "sigma_deviation_um": one["sigma_um"]}
             row |= {"residual_um": one["residual_um"], "is_outlier": int(one["is_outlier"])}
         rows.append(row)
-    return Table(_FIXES, rows)
+    return ColumnTable(_FIXES, rows)
 
 
 def _list(numbers: Iterable[int]) -> str:
     return " ".join(map(str, numbers))
 
 
-def panel_table(mirror: Mirror, panels: Sequence[PanelResult]) -> Table:
+def panel_table(mirror: Mirror, panels: Sequence[PanelResult]) -> ColumnTable:
     """Position and tilt of each determined panel, and the turns of its adjusters."""
     names = panels[0].adjusters if panels else ()
     columns = {
@@ -177,15 +177,15 @@ def panel_table(mirror: Mirror, panels: Sequence[PanelResult]) -> Table:
             data |= zip([f"sigma_bending_{name}_um" for name in names], data["bending_adjusters_sigma_um"], strict=True)
         data |= zip(("worst_corner_um", "sigma_worst_corner_um"), corner_um, strict=True)
         rows.append(data)
-    return Table(columns, rows)
+    return ColumnTable(columns, rows)
 
 
-def all_panels_table(found: Findings) -> Table:
+def all_panels_table(found: Findings) -> ColumnTable:
     """Every panel that has measured points; one that they do not determine has its place and their number."""
     result = found.alignment
     table = panel_table(found.record.mirror, () if result is None else result.panels)
     others = () if result is None else result.undetermined
-    return Table(table.columns, [*table.rows, *({**one.panel._asdict(), "points": one.points} for one in others)])
+    return ColumnTable(table.columns, [*table.rows, *({**one.panel._asdict(), "points": one.points} for one in others)])
 
 
 _WORK = {
@@ -201,7 +201,7 @@ _WORK = {
 }
 
 
-def work_table(steps: Sequence[Step]) -> Table:
+def work_table(steps: Sequence[Step]) -> ColumnTable:
     """The steps of a work list, in their order."""
     rows = [
         {
@@ -217,10 +217,10 @@ def work_table(steps: Sequence[Step]) -> Table:
         }
         for step in steps
     ]
-    return Table(_WORK, rows)
+    return ColumnTable(_WORK, rows)
 
 
-def moves_table(found: Findings) -> Table:
+def moves_table(found: Findings) -> ColumnTable:
     """Every adjuster of each determined panel."""
     rows = []
     for panel in () if found.alignment is None else found.alignment.panels:
@@ -229,4 +229,4 @@ def moves_table(found: Findings) -> Table:
         for name, (x_m, y_m), move, sigma in moves:
             row = {**panel.panel._asdict(), "adjuster": name, "x_m": round(x_m, 6), "y_m": round(y_m, 6)}
             rows.append({**row, "move_um": move, "sigma_move_um": sigma})
-    return Table(_MOVES, rows)
+    return ColumnTable(_MOVES, rows)

@@ -57,7 +57,7 @@ class EdgeLimits:
         self.clear = cfg.clear_samples
 
 
-class Start(NamedTuple):
+class EpisodeStart(NamedTuple):
     """Where an episode began, in the frame of the odometry: robot and sensor, m, and heading."""
 
     robot: Place
@@ -74,7 +74,7 @@ class OnMap(NamedTuple):
     sigma_m: float
 
 
-class Travel(NamedTuple):
+class EpisodeTravel(NamedTuple):
     """Displacements of sensor and robot since the start, m; deck frame, without a place on the map the odometry's."""
 
     sensor: Place
@@ -100,7 +100,7 @@ class SeamCrossing(NamedTuple):
 
     axis: Axis
     side: float
-    begin: Travel
+    begin: EpisodeTravel
     is_second: bool = False
 
 
@@ -112,7 +112,7 @@ class FoundEdge(NamedTuple):
     limit_m: float
 
 
-_NO_TRAVEL = Travel((0.0, 0.0), (0.0, 0.0))
+_NO_TRAVEL = EpisodeTravel((0.0, 0.0), (0.0, 0.0))
 
 
 class EdgeEpisode:
@@ -260,13 +260,13 @@ class EdgeEpisode:
 
     # -- what the map shows ---------------------------------------------------------------------------------------
 
-    def _travel_of(self, odometry: Odometry, place: Place) -> Travel:
+    def _travel_of(self, odometry: Odometry, place: Place) -> EpisodeTravel:
         start, on_map = self._start, self._on_map
         c, s = (1.0, 0.0) if on_map is None else (on_map.cos, on_map.sin)
         dx, dy = place[0] - start.sensor[0], place[1] - start.sensor[1]
         sensor = c * dx - s * dy, s * dx + c * dy
         dx, dy = odometry.x_m - start.robot[0], odometry.y_m - start.robot[1]
-        return Travel(sensor, (c * dx - s * dy, s * dx + c * dy))
+        return EpisodeTravel(sensor, (c * dx - s * dy, s * dx + c * dy))
 
     def _classify(self) -> None:
         """Find out, once the sensor has moved, how it left the panel and how the map explains it."""
@@ -362,11 +362,11 @@ class EdgeEpisode:
         return FoundEdge(BEYOND_SEAM, way_m, limit_m) if way_m > limit_m else None
 
 
-def _start(odometry: Odometry, offset_m: Place) -> Start:
+def _start(odometry: Odometry, offset_m: Place) -> EpisodeStart:
     x, y, heading_rad = odometry.x_m, odometry.y_m, odometry.heading_rad
     c, s = cos(heading_rad), sin(heading_rad)
     sensor = x + c * offset_m[0] - s * offset_m[1], y + s * offset_m[0] + c * offset_m[1]
-    return Start((x, y), sensor, heading_rad)
+    return EpisodeStart((x, y), sensor, heading_rad)
 
 
 def _side(departure: Departure, axis: Axis) -> float:

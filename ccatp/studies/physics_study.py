@@ -138,7 +138,7 @@ class Truth(NamedTuple):
     has_fallen: bool
 
 
-class Drive:
+class PhysicsDrive:
     """A robot with rigid-body physics on set points; the danger monitors get its true pose. ``verdict``: the last."""
 
     def __init__(self, cfg: Config, mirror: Mirror, start: DeckPose) -> None:
@@ -237,7 +237,7 @@ def run_stops(job: Job) -> JobOutcome:
     speed_m_s = cfg.limits.v_max_m_s
     further_m, overruns_m, falls, missed = [], [], 0, 0
     for start, reverse in drives_to_rim(mirror):
-        drive, twist = Drive(cfg, mirror, start), Twist(-speed_m_s if reverse else speed_m_s, 0.0)
+        drive, twist = PhysicsDrive(cfg, mirror, start), Twist(-speed_m_s if reverse else speed_m_s, 0.0)
         frames = round((2.0 * _INSIDE_M / speed_m_s + 1.0) / 0.01)
         while frames and (drive.verdict is None or drive.verdict.code is not EventCode.NEAR_EDGE):
             drive.step(twist)
@@ -250,7 +250,7 @@ def run_stops(job: Job) -> JobOutcome:
         further_m.append(overruns_m[-1] - at_m)
     stops_m = []
     for k in range(8):
-        drive = Drive(cfg, mirror, DeckPose(0.0, 0.0, k * pi / 4.0))  # the rim is far
+        drive = PhysicsDrive(cfg, mirror, DeckPose(0.0, 0.0, k * pi / 4.0))  # the rim is far
         for _ in range(round(speed_m_s / cfg.limits.a_max_m_s2 / 0.01) + 20):
             drive.step(Twist(speed_m_s, 0.0))
         stops_m.append(drive.stop())
@@ -319,7 +319,7 @@ def run_slides(job: Job) -> JobOutcome:
     for way, twist in (("drive", Twist(cfg.limits.v_max_m_s, 0.0)), ("turn", Twist(0.0, 0.5))):
         found: list[int] = []
         for heading_rad in _HEADINGS_RAD:
-            drive = Drive(cfg, mirror, DeckPose(0.0, 0.0, heading_rad))
+            drive = PhysicsDrive(cfg, mirror, DeckPose(0.0, 0.0, heading_rad))
             for _ in range(_REST_FRAMES):
                 drive.step(twist)
             drive.set_friction(cfg.sim.physics.friction)

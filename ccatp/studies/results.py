@@ -187,7 +187,7 @@ class Measure(NamedTuple):
     is_log: bool = True
 
 
-class Row(NamedTuple):
+class FigureRow(NamedTuple):
     """A row of a figure of ranges; the value of a base is drawn as a line through all rows, for comparison."""
 
     label: str
@@ -196,16 +196,18 @@ class Row(NamedTuple):
     is_base: bool = False
 
 
-def rows_by(cells: Sequence[CellResult], factor: str, *others: str) -> list[Row]:
+def rows_by(cells: Sequence[CellResult], factor: str, *others: str) -> list[FigureRow]:
     """A row for each cell, labelled by its factors, with a colour for each level of the first one."""
     known = levels(cells, factor)
     return [
-        Row(", ".join(str(cell.factors[name]) for name in (factor, *others)), cell, known.index(cell.factors[factor]))
+        FigureRow(
+            ", ".join(str(cell.factors[name]) for name in (factor, *others)), cell, known.index(cell.factors[factor])
+        )
         for cell in cells
     ]
 
 
-def draw_ranges(rows: Sequence[Row], measures: Sequence[Measure], title: str, stem: Path) -> None:
+def draw_ranges(rows: Sequence[FigureRow], measures: Sequence[Measure], title: str, stem: Path) -> None:
     """Draw the values of cells: a panel for each measure, a row for each cell."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter  # noqa: PLC0415 - takes a second
 

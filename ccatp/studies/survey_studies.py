@@ -27,7 +27,7 @@ from ccatp.studies.mission_study import (
     rms_and_p50,
     run_mission,
 )
-from ccatp.studies.results import LIMIT, Measure, Row, colour, draw_ranges, grouped, levels, plot, rows_by
+from ccatp.studies.results import LIMIT, FigureRow, Measure, colour, draw_ranges, grouped, levels, plot, rows_by
 from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.planning.tour_bound import tour_bound
 
@@ -302,11 +302,11 @@ def _drawing(name: str, factor: str, groups: Sequence[str], title: str) -> Calla
     return draw
 
 
-def _row(cell: CellResult, factor: str) -> Row:
+def _row(cell: CellResult, factor: str) -> FigureRow:
     """A row with a colour for each world; cells without a change are the base."""
     world, level = str(cell.factors["world"]), str(cell.factors[factor])
     label = {"group": level, "without": f"without {level}"}[factor]
-    return Row(_BASES.get(level, label).format(world), cell, WORLDS.index(world), level in _BASES)
+    return FigureRow(_BASES.get(level, label).format(world), cell, WORLDS.index(world), level in _BASES)
 
 
 SENSITIVITY = Study(

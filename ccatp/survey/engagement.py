@@ -259,7 +259,7 @@ def enter(s: S, event: Event, phase: Phase) -> S:
     return replace(s, phase=phase) if TRANSITIONS[s.phase.kind].get(event) is phase.kind else s
 
 
-class Row(NamedTuple):
+class Reaction(NamedTuple):
     """One reaction of a mission to a verdict.
 
     ``applies``: whether the row applies to a state and a verdict; ``when`` describes this. ``react``: from the rules, a
@@ -279,7 +279,7 @@ class EngagementRules(ABC, Generic[S]):
     is not trusted. ``stuck_limit_s``: how long it waits at an edge that no motion helps to leave.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[Reaction, ...]
     stuck_limit_s = inf
 
     # -- transitions --------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from ccatp.survey.engagement import (
     EngagementRules,
     Held,
     Kind,
-    Row,
+    Reaction,
     S,
 )
 
@@ -101,27 +101,27 @@ def _go_home(rules: EngagementRules[S], s: S, _frame: object, v: Verdict) -> tup
     return rules.abort(replace(s, emergency_epoch=v.raised), v.cause), False
 
 
-ON_EARTHQUAKE = Row(
+ON_EARTHQUAKE = Reaction(
     "an earthquake is latched, and no edge is to be left",
     Action.EARTHQUAKE,
     lambda _, v: v.is_shaking and v.code is not NEAR_EDGE,
     _stand_in_earthquake,
 )
-ON_FAULT = Row("the severity is fault", Action.FAULT, lambda _, v: v.severity is FAULT, stand)
-ON_HOLD = Row(
+ON_FAULT = Reaction("the severity is fault", Action.FAULT, lambda _, v: v.severity is FAULT, stand)
+ON_HOLD = Reaction(
     "the severity is hold or above, and nothing is permitted",
     Action.HOLD,
     lambda _, v: v.severity >= HOLD and is_denied(v),
     stand,
 )
-ON_UNKNOWN = Row(
+ON_UNKNOWN = Reaction(
     "the cause is not known here: the danger loop is of another version",
     Action.HOLD,
     lambda _, v: bool(v.cause) and row_of(v) is None,
     _hold,
 )
-ON_NO_VERDICT = Row("no verdict is fresh enough", Action.PAUSE, lambda _, v: v is NO_FRESH_VERDICT, _meet)
-ON_EMERGENCY = Row(
+ON_NO_VERDICT = Reaction("no verdict is fresh enough", Action.PAUSE, lambda _, v: v is NO_FRESH_VERDICT, _meet)
+ON_EMERGENCY = Reaction(
     "an emergency is new",
     Action.RETURN,
     lambda s, v: v.code is ABORTED and v.raised != s.emergency_epoch,
@@ -179,29 +179,29 @@ ROWS = (
     ON_EARTHQUAKE,
     ON_FAULT,
     ON_UNKNOWN,
-    Row(
+    Reaction(
         "the severity is hold for a fault of one edge sensor, and nothing is permitted",
         Action.LOCATE,
         lambda _, v: action_of(v) is Action.LOCATE and is_denied(v),
         _locate,
     ),
     ON_HOLD,
-    Row(
+    Reaction(
         "the severity begins or ceases to be slow or return",
         Action.SLOW,
         lambda s, v: s.is_slow is not (v.severity in REDUCED) and v is not NO_FRESH_VERDICT,
         _change_speed,
     ),
-    Row(
+    Reaction(
         "the severity is return for a new cause, and no edge is to be left",
         Action.RETURN,
         lambda s, v: v.severity is RETURN and v.code is not NEAR_EDGE and v.cause != s.finding,
         _return,
     ),
-    Row("a retreat led nowhere", Action.WAIT, lambda s, _: _is_stuck(s), _wait_at_edge),
-    Row("an edge is declared (code 1)", Action.RETREAT, lambda _, v: v.code is NEAR_EDGE, _retreat),
+    Reaction("a retreat led nowhere", Action.WAIT, lambda s, _: _is_stuck(s), _wait_at_edge),
+    Reaction("an edge is declared (code 1)", Action.RETREAT, lambda _, v: v.code is NEAR_EDGE, _retreat),
     ON_NO_VERDICT,
-    Row(
+    Reaction(
         "some motion is not permitted",
         Action.PAUSE,
         lambda _, v: not (v.forward and v.reverse and v.turn),

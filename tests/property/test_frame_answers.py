@@ -14,23 +14,33 @@ from ccatp.beacons.links.messages import BeaconFrame
 from ccatp.beacons.safety.rules import BeaconSafetyRules
 from ccatp.core import NO_CAUSE, EventCode, Verdict
 from ccatp.danger import DangerMonitor
-from ccatp.links.frame_answers import AWAY_SLACK_S, DriveRule, FrameId, JudgedFrame, PermitRule, is_restart, permitted
+from ccatp.links.frame_answers import (
+    AWAY_SLACK_S,
+    DriveRule,
+    FrameStamp,
+    JudgedFrame,
+    PermitRule,
+    is_restart,
+    permitted,
+)
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.missions import kind_of
 from tests.support.scenario import config_of, radio_config_of
 
 NOTHING, ALL = (False, False, False), (True, True, True)
-frames = st.builds(FrameId, st.integers(0, 1), st.integers(1, 2), st.integers(0, 5), st.sampled_from((0.0, 0.01, 0.02)))
+frames = st.builds(
+    FrameStamp, st.integers(0, 1), st.integers(1, 2), st.integers(0, 5), st.sampled_from((0.0, 0.01, 0.02))
+)
 permits = st.tuples(st.booleans(), st.booleans(), st.booleans())
 
 
-def verdict_on(frame: FrameId, allowed: tuple[bool, bool, bool] = ALL) -> Verdict:
+def verdict_on(frame: FrameStamp, allowed: tuple[bool, bool, bool] = ALL) -> Verdict:
     return Verdict(frame.seq, frame.t_s, EventCode.NORMAL, NO_CAUSE, "", 0.0, 0.0, *allowed)
 
 
 @given(frames, frames, permits)
 def test_a_verdict_permits_motion_on_its_own_frame_only(
-    newest: FrameId, other: FrameId, allowed: tuple[bool, bool, bool]
+    newest: FrameStamp, other: FrameStamp, allowed: tuple[bool, bool, bool]
 ) -> None:
     found = permitted(newest, JudgedFrame(other, verdict_on(other, allowed)))
     assert found == (allowed if other == newest else NOTHING)
@@ -48,8 +58,8 @@ steps = st.one_of(
 @given(st.lists(steps, max_size=60))
 def test_every_permit_of_motion_is_that_of_the_frame_that_it_answers(story: list[object]) -> None:
     rule, session, seq = PermitRule(), 1, 0
-    newest: FrameId | None = None
-    judged = dict[FrameId, tuple[bool, bool, bool]]()
+    newest: FrameStamp | None = None
+    judged = dict[FrameStamp, tuple[bool, bool, bool]]()
     highest, number = -1, 0
     for step in story:
         if step == "session":
@@ -60,7 +70,7 @@ def test_every_permit_of_motion_is_that_of_the_frame_that_it_answers(story: list
             highest = -1
         elif isinstance(step, tuple):
             seq, is_judged, allowed, is_other = step
-            frame = FrameId(0, session, seq, 0.01 * seq)
+            frame = FrameStamp(0, session, seq, 0.01 * seq)
             is_new = newest is None or seq > newest.seq
             assert rule.take(frame) is (is_new and seq > highest)
             if is_new and seq > highest:
@@ -151,25 +161,27 @@ def test_permits_and_judged_frames_are_made_in_one_place() -> None:
 
 # -- restarts ----------------------------------------------------------------------------------------------------------
 
-BEFORE = FrameId(7, 1, 500, 5.0)
+BEFORE = FrameStamp(7, 1, 500, 5.0)
 
 
 @pytest.mark.parametrize(
     ("first", "away_s", "restarted"),
     [
-        (FrameId(7, 2, 500, 5.0), 0.0, False),  # in lockstep the last frame comes again
-        (FrameId(7, 2, 501, 5.01), 0.5, False),
-        (FrameId(7, 2, 2500, 25.0), 20.0, False),
-        (FrameId(7, 2, 2480, 24.8), 20.0, False),  # its clock is slow by 1 %
-        (FrameId(8, 2, 501, 5.01), 0.5, True),
-        (FrameId(7, 2, 499, 5.5), 0.5, True),
-        (FrameId(7, 2, 501, 4.99), 0.5, True),
-        (FrameId(7, 2, 1, 0.01), 0.5, True),
-        (FrameId(7, 2, 800, 8.0), 20.0, True),  # its numbers have passed the old ones already
-        (FrameId(7, 2, 1490, 14.9 + 10.0), 20.0 + AWAY_SLACK_S, False),
+        (FrameStamp(7, 2, 500, 5.0), 0.0, False),  # in lockstep the last frame comes again
+        (FrameStamp(7, 2, 501, 5.01), 0.5, False),
+        (FrameStamp(7, 2, 2500, 25.0), 20.0, False),
+        (FrameStamp(7, 2, 2480, 24.8), 20.0, False),  # its clock is slow by 1 %
+        (FrameStamp(8, 2, 501, 5.01), 0.5, True),
+        (FrameStamp(7, 2, 499, 5.5), 0.5, True),
+        (FrameStamp(7, 2, 501, 4.99), 0.5, True),
+        (FrameStamp(7, 2, 1, 0.01), 0.5, True),
+        (FrameStamp(7, 2, 800, 8.0), 20.0, True),  # its numbers have passed the old ones already
+        (FrameStamp(7, 2, 1490, 14.9 + 10.0), 20.0 + AWAY_SLACK_S, False),
     ],
 )
-def test_a_restart_shows_in_boot_number_frame_number_or_clock(first: FrameId, away_s: float, restarted: bool) -> None:
+def test_a_restart_shows_in_boot_number_frame_number_or_clock(
+    first: FrameStamp, away_s: float, restarted: bool
+) -> None:
     assert is_restart(BEFORE, first, away_s) is restarted
 
 
@@ -180,6 +192,6 @@ def test_a_robot_that_restarted_while_it_was_away_is_never_taken_for_the_old_one
     """With the same boot number: its clock cannot show more than the time for which it was away."""
     up_s = 0.01 * before
     first_s = min(0.01 * after, away_s)
-    first = FrameId(7, 2, round(100.0 * first_s), first_s)
+    first = FrameStamp(7, 2, round(100.0 * first_s), first_s)
     if up_s > AWAY_SLACK_S + 0.03 * away_s:
-        assert is_restart(FrameId(7, 1, before, up_s), first, away_s)
+        assert is_restart(FrameStamp(7, 1, before, up_s), first, away_s)

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from ccatp.core import ALL_MOTION
-from ccatp.links.frame_answers import DriveRule, FrameId, PermitRule
+from ccatp.links.frame_answers import DriveRule, FrameStamp, PermitRule
 from ccatp.links.robot_messages import Drive, Permit, Role
 from ccatp.onboard.rules import MotionRules
-from ccatp.onboard.sessions import RobotServer, RobotSession
+from ccatp.onboard.sessions import ClientSession, RobotServer
 from tests.faults.linking import Measured
 from tests.property.two_keys import DIRECTIONS, HZ, TTL, Bounds, Robot, Violation, explore
 
@@ -126,7 +126,7 @@ class RobotMutant(Robot):
 class ServerMutant(RobotServer):
     """A server that goes on obeying a session that has ended."""
 
-    def lost(self, session: RobotSession) -> None:
+    def lost(self, session: ClientSession) -> None:
         role = session.role
         super().lost(session)
         session.role = role
@@ -150,7 +150,7 @@ class Careless(PermitRule):
 class RepeatsVerdict(Careless):
     """A frame that is not judged gets the last verdict."""
 
-    def take(self, frame: FrameId) -> bool:
+    def take(self, frame: FrameStamp) -> bool:
         judged = self._judged
         is_new = super().take(frame)
         self._judged = judged
@@ -179,7 +179,7 @@ class PermitsAtOnce(PermitRule):
 class JudgesTwice(PermitRule):
     """The last frame of the session before is judged again."""
 
-    def take(self, frame: FrameId) -> bool:
+    def take(self, frame: FrameStamp) -> bool:
         self._highest_seq = -1
         return super().take(frame)
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from ccatp.core import NO_CAUSE, EventCode, Verdict
-from ccatp.links.frame_answers import DriveRule, FrameId, PermitRule, is_restart
+from ccatp.links.frame_answers import DriveRule, FrameStamp, PermitRule, is_restart
 from ccatp.links.robot_messages import Drive, Join, Permit, RobotData, Role
 from ccatp.onboard.rules import LinkedRobot
-from ccatp.onboard.sessions import RobotServer, RobotSession
+from ccatp.onboard.sessions import ClientSession, RobotServer
 
 FIRST = 1000  # number of the first frame, so that a robot can count from below
 HZ, TTL = 100.0, 2  # the time to live in ticks, a tick is a frame
@@ -79,7 +79,7 @@ class Robot(LinkedRobot):
         return found
 
 
-class Session(RobotSession):
+class Session(ClientSession):
     """The robot's end of a connection."""
 
     def write(self, data: bytes) -> None:
@@ -165,8 +165,8 @@ class Danger:
 
     rule: PermitRule = field(default_factory=PermitRule)
     sessions: int = 0
-    before: FrameId | None = None
-    newest: FrameId | None = None  # of the session, as the link counts
+    before: FrameStamp | None = None
+    newest: FrameStamp | None = None  # of the session, as the link counts
     allowed: Allowed | None = None  # for the reference: the verdict on the newest frame, if it was judged
     is_present: bool = True  # for the reference: the newest frame is of the robot's present boot
     highest: int = -1  # for the reference: the newest frame of the present boot that was judged
@@ -201,7 +201,7 @@ class Bounds:
     drives_still: bool = False
     makes_permits: Callable[[], PermitRule] = PermitRule
     makes_drives: Callable[[], DriveRule] = DriveRule
-    restarted: Callable[[FrameId, FrameId], bool] = is_restart
+    restarted: Callable[[FrameStamp, FrameStamp], bool] = is_restart
     makes_robot: Callable[[], Robot] = lambda: Robot((TTL / HZ, 8.0, 0.0), 1.0 / HZ, HZ)
     makes_server: Callable[[Robot], RobotServer] = lambda robot: RobotServer(robot, lockstep=False)
 
@@ -430,7 +430,7 @@ class World:
 
     def _judge(self, link: Connection, frame: Frame, answer: Allowed | None) -> None:
         danger = self.danger
-        known = FrameId(0, danger.sessions, frame.seq, frame.seq / HZ)
+        known = FrameStamp(0, danger.sessions, frame.seq, frame.seq / HZ)
         if danger.newest is not None and known.seq <= danger.newest.seq:
             if known == danger.newest:
                 self._send_again(link)
@@ -492,7 +492,7 @@ class World:
         if not is_kept:
             link.up = link.up[:n] + link.up[n + 1 :]
         role = link.session.role
-        if role is not None:  # as in ``RobotSession``
+        if role is not None:  # as in ``ClientSession``
             self.server.command(link.session, role, sent.command, self.robot.t_s)
         if link.is_served:
             self.reference.take(link.role, sent)

@@ -18,7 +18,7 @@ from ccatp.dataloop import DataLoop, motor_robot, survey_robot
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.onboard.sessions import RobotServer, RobotSession, ServerLog
+from ccatp.onboard.sessions import ClientSession, RobotServer, ServerLog
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.robot import Robot
@@ -143,7 +143,7 @@ class SurveyLoop(DataLoop):
         return await super().start(listener or any_port())
 
 
-class Client(RobotSession):
+class Client(ClientSession):
     """One end of a connection to a `ServedRobot`; `sent` is what the robot sent."""
 
     def __init__(self, server: RobotServer, now_s: Callable[[], float]) -> None:

@@ -21,7 +21,7 @@ from ccatp.beacons.studies.mote_runs import look_ahead, percentiles, run_batch, 
 from ccatp.config.models import Config
 from ccatp.core import FloatArray
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
-from ccatp.studies.results import LIMIT, Measure, Row, band, colour, draw_ranges, plot, write_analysis
+from ccatp.studies.results import LIMIT, FigureRow, Measure, band, colour, draw_ranges, plot, write_analysis
 
 UPDATES = 300  # in figures 11 and 12, as read from the figures
 SHOWN = 30  # updates after which figure 14 has converged
@@ -152,7 +152,7 @@ def draw(cells: Sequence[CellResult], out: Path) -> None:
             _draw_traces(found, shown, title, goal_m, out / stem)
     if maps := [(name, title) for name, title in _MAPS if name in found]:
         _draw_maps(found, maps, out / "figure_9_10_13")
-    draw_ranges([Row(str(cell.factors["case"]), cell) for cell in cells], [WAYS], "All ways", out / "ways")
+    draw_ranges([FigureRow(str(cell.factors["case"]), cell) for cell in cells], [WAYS], "All ways", out / "ways")
 
 
 def _draw_traces(found: Mapping[str, CellResult], names: Sequence[str], title: str, goal_m: float, stem: Path) -> None:

@@ -40,7 +40,7 @@ from ccatp.kinematics import wrap_pi
 from ccatp.missions import Part
 from ccatp.report.plots import INK
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
-from ccatp.studies.results import LIMIT, Measure, Row, band, chi_square_band, colour, draw_ranges, grouped, plot
+from ccatp.studies.results import LIMIT, FigureRow, Measure, band, chi_square_band, colour, draw_ranges, grouped, plot
 
 # -- a run with truth and estimates ------------------------------------------------------------------------------------
 
@@ -404,7 +404,7 @@ def draw_cases(results: Sequence[CellResult], out: Path) -> None:
     measures = [
         Measure(f"{name}, RMSE, m", (key, key), key, f"printed.{name}", is_log=False) for name, key in shown.items()
     ]
-    rows = [Row(f"case {result.factors['case']}", result) for result in results]
+    rows = [FigureRow(f"case {result.factors['case']}", result) for result in results]
     draw_ranges(rows, measures, "Mean of the runs (dot), 2017 (mark)", out / "radio_cases")
 
 

@@ -93,13 +93,13 @@ def require(is_kept: bool, seen: str) -> None:
 # -- messages -----------------------------------------------------------------------------------------------------
 
 
-class Part(BaseModel):
+class MessagePart(BaseModel):
     """Part of a message. Numbers must be finite, not booleans or text; additional keys are ignored."""
 
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
 
 
-PartT = TypeVar("PartT", bound=Part)
+PartT = TypeVar("PartT", bound=MessagePart)
 Positive = Annotated[float, Field(gt=0.0)]
 Two = Annotated[list[float], Field(min_length=2, max_length=2)]
 Three = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -117,7 +117,7 @@ def parse(model: type[PartT], message: Message, where: str = "") -> PartT:
         raise CheckFailed(where + (seen if own is None else f"{name}: {own}" if name else f"{own}")) from None
 
 
-class Timing(Part):
+class RobotTiming(MessagePart):
     """Clock of the robot, in its hello; a robot with a vehicle may send fewer frames."""
 
     lockstep: bool
@@ -140,7 +140,7 @@ class Timing(Part):
         return 1.0 / self.frame_hz
 
 
-class Body(Part):
+class RobotBody(MessagePart):
     """Sizes of the robot that the checks need. With impossible sizes no check that moves the wheels runs."""
 
     wheel_radius_m: WheelRadius
@@ -161,11 +161,11 @@ class Body(Part):
         return self
 
 
-class Facts(Timing):
+class Facts(RobotTiming):
     """The parts of the server's hello that the checks need."""
 
     auth: Any = None
-    robot: Body
+    robot: RobotBody
 
     @property
     def needs_mac(self) -> bool:
@@ -173,7 +173,7 @@ class Facts(Timing):
         return bool(self.auth == AUTH_HMAC)
 
 
-class Echo(Part):
+class Echo(MessagePart):
     """The command echo of a frame."""
 
     seq: int
@@ -182,7 +182,7 @@ class Echo(Part):
     held: bool
 
 
-class Frame(Part):
+class Frame(MessagePart):
     """The parts of a sensors frame that the checks need.
 
     ``enc`` has samples (t, right, left) of the wheels in s and rad/s; ``imu`` (t, ax, wz) in s, m/s^2, rad/s.

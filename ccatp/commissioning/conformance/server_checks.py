@@ -14,19 +14,19 @@ from pydantic import Field
 
 from ccatp.commissioning.conformance.harness import (
     STILL,
-    Body,
     CheckContext,
     CheckFailed,
     CheckList,
     ControllerAndMonitor,
     Frame,
     Message,
+    MessagePart,
     NotApplicable,
-    Part,
     Positive,
     RawConnection,
+    RobotBody,
+    RobotTiming,
     Three,
-    Timing,
     parse,
     require,
     shorten,
@@ -69,21 +69,21 @@ Frames = Sequence[Message]
 # -- hello ------------------------------------------------------------------------------------------------------------
 
 
-class _HelloPart(Timing):
+class _HelloPart(RobotTiming):
     protocol: str
     boot: int
     nonce: Annotated[str, Field(pattern=r"^[0-9a-fA-F]{32}$")]
     auth: Literal["none", "hmac-sha256"]
 
 
-class _VehiclePart(Part):
+class _VehiclePart(MessagePart):
     kind: Literal["ackermann", "differential"]
     axle_distance_m: Positive
     steer_max_rad: Annotated[float, Field(ge=0.0, le=1.6)]
     distance_sensors_rad: list[Annotated[float, Field(ge=-6.3, le=6.3)]]
 
 
-class _RobotPart(Body):
+class _RobotPart(RobotBody):
     vehicle: _VehiclePart | None = None
     fan_floor: Fraction
     puck_m: Annotated[list[Near], Field(min_length=3, max_length=3)]
@@ -91,7 +91,7 @@ class _RobotPart(Body):
                               Field(min_length=4, max_length=4)]  # fmt: skip
 
 
-class _HelloRobot(Part):
+class _HelloRobot(MessagePart):
     robot: _RobotPart
 
 
@@ -305,22 +305,22 @@ def _refused(context: CheckContext, connection: RawConnection, *reasons: str) ->
 # -- frames -----------------------------------------------------------------------------------------------------------
 
 
-class _SamplesPart(Part):
+class _SamplesPart(MessagePart):
     imu: list[Three]
     enc: list[Three]
     edge: list[Annotated[list[float], Field(min_length=5, max_length=5)]]
 
 
-class _GravityPart(Part):
+class _GravityPart(MessagePart):
     gravity: Annotated[list[float], Field(min_length=4, max_length=4)] | None
 
 
-class _StatePart(Part):
+class _StatePart(MessagePart):
     fans: Annotated[list[Fraction], Field(min_length=2, max_length=2)]
     soc: Fraction
 
 
-class _FaultsPart(Part):
+class _FaultsPart(MessagePart):
     faults: list[FaultName]
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ccatp.config.files import read_key
 from ccatp.config.models import LinkConfig
 from ccatp.errors import DaemonUnreachableError
-from ccatp.links.frame_answers import FrameId, is_restart
+from ccatp.links.frame_answers import FrameStamp, is_restart
 from ccatp.links.robot_link import (
     ImpossibleRobot,
     LinkHandler,
@@ -75,7 +75,7 @@ class RobotSession:
         self._deadline_s: float | None = None
         self.hello: Hello | None = None
         # The newest frame of the last session that had frames, and when this session was lost.
-        self._before: FrameId | None = None
+        self._before: FrameStamp | None = None
         self._lost_s = 0.0
         self.link = self._make()
 
@@ -96,9 +96,9 @@ class RobotSession:
             ),
         )
 
-    def frame_id(self, sensors: Sensors) -> FrameId:
+    def frame_id(self, sensors: Sensors) -> FrameStamp:
         """The identity of a frame of the present session."""
-        return FrameId(-1 if self.hello is None else self.hello.boot, self.count, sensors.seq, sensors.t)
+        return FrameStamp(-1 if self.hello is None else self.hello.boot, self.count, sensors.seq, sensors.t)
 
     async def join(self, *, is_patient: bool) -> None:
         """Join for the first time. Raises ``DaemonUnreachableError``: the robot does not answer, or refuses.

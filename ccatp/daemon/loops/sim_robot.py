@@ -8,7 +8,7 @@ from pathlib import Path
 
 import structlog
 
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.daemon.supervision.child_processes import listen
 from ccatp.daemon.supervision.process import FAULTS_FILE, Endpoints, open_log, run_until_stopped, start_process
 from ccatp.dataloop import SimOutlets, StandInOptions, serve
@@ -37,7 +37,7 @@ def main() -> int:
 
 
 def run_alone(
-    cfg: MissionConfig, lockstep: bool, faults: FaultPlan | None = None, runtime_dir: Path | None = None
+    cfg: CommonConfig, lockstep: bool, faults: FaultPlan | None = None, runtime_dir: Path | None = None
 ) -> int:
     """Run only the simulated robot of any mission, for other controllers, until SIGINT or SIGTERM.
 

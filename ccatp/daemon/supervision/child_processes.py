@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar
 
 from ccatp.config.load import load_mission
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.config.models import DashboardConfig, ProcessesConfig
 from ccatp.daemon.supervision.fork_server import ChildProcess, start_module
 from ccatp.daemon.supervision.process import listen_at, run_dir_in
@@ -323,7 +323,7 @@ class ServerAddress(Protocol):
         """Port; 0 takes any free one."""
 
 
-def process_table(cfg: MissionConfig) -> tuple[ProcessSpec, ...]:
+def process_table(cfg: CommonConfig) -> tuple[ProcessSpec, ...]:
     """The processes of a run of a configuration, in the order of starting."""
     table: tuple[ProcessSpec, ...] = kind_of(cfg).processes.get()
     return table
@@ -337,7 +337,7 @@ class SimulatedServer(NamedTuple):
     at: ServerAddress
 
 
-def simulated_servers(cfg: MissionConfig) -> list[SimulatedServer]:
+def simulated_servers(cfg: CommonConfig) -> list[SimulatedServer]:
     """The simulated servers of a run of a configuration."""
     servers = [one for one in process_table(cfg) if one.is_simulator]
     return [
@@ -345,7 +345,7 @@ def simulated_servers(cfg: MissionConfig) -> list[SimulatedServer]:
     ]
 
 
-C = TypeVar("C", bound=MissionConfig)
+C = TypeVar("C", bound=CommonConfig)
 
 
 def with_addresses(cfg: C, sockets: Mapping[str, socket.socket]) -> C:

@@ -4,14 +4,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ccatp.config.files import read_key
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.daemon.operator.observatory import CLIENTS_FILE, KEY_FILE
 from ccatp.errors import ConfigError
 from ccatp.links.auth import read_clients, read_pair
 from ccatp.report.dashboard.access import read_tokens
 
 
-def check_named_files(cfg: MissionConfig, *, is_sim: bool) -> None:
+def check_named_files(cfg: CommonConfig, *, is_sim: bool) -> None:
     """Read them all once. ConfigError: one line for each that cannot be used.
 
     ``is_sim``: the key of the robot is no secret.
@@ -26,7 +26,7 @@ def check_named_files(cfg: MissionConfig, *, is_sim: bool) -> None:
         raise ConfigError(*problems)
 
 
-def _readers(cfg: MissionConfig, *, is_sim: bool) -> Iterator[Callable[[], object]]:
+def _readers(cfg: CommonConfig, *, is_sim: bool) -> Iterator[Callable[[], object]]:
     observatory, token_file = cfg.observatory, cfg.dashboard.token_file
     if observatory.endpoint:
         yield lambda: read_clients(Path(observatory.clients_file), CLIENTS_FILE)

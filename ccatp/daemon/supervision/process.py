@@ -25,7 +25,7 @@ import zmq
 
 from ccatp.config.files import keep_traceback, read_input
 from ccatp.config.load import load_mission
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.daemon.supervision.fork_server import SUPERVISOR_PID
 from ccatp.errors import CcatpError
 
@@ -74,7 +74,7 @@ def run_dir_in(runtime_dir: Path) -> Path | None:
 class RunContext:
     """What belongs to one run, for everything that works on it."""
 
-    config: MissionConfig
+    config: CommonConfig
     run_dir: Path
     endpoints: Endpoints
     is_sim: bool  # robot and laser system are simulated
@@ -85,7 +85,7 @@ class RunContext:
 class ProcessArgs:
     """Arguments of a process."""
 
-    config: MissionConfig  # from the run directory
+    config: CommonConfig  # from the run directory
     run_dir: Path
     endpoints: Endpoints
     listen_fd: int | None  # an inherited listening socket

@@ -13,7 +13,7 @@ from typing import Any
 from uuid import uuid4
 
 from ccatp.config.files import read_input, read_text, write_durably
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE
 from ccatp.daemon.supervision.run_text import RunText
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError
@@ -144,7 +144,7 @@ def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Pa
     return parent / f"{now_utc:%Y%m%dT%H%M%SZ}-{PurePath(mirror).stem}-s{seed}"
 
 
-def recover(options: RunOptions, cfg: MissionConfig, run: Callable[[RunOptions, MissionConfig], int]) -> int:
+def recover(options: RunOptions, cfg: CommonConfig, run: Callable[[RunOptions, CommonConfig], int]) -> int:
     """Continue, held, the run that did not finish; otherwise begin a new one that can be recovered."""
     run_dir = find_resumable()
     if run_dir is not None:
@@ -280,12 +280,12 @@ def check_takes_faults(kind: MissionKind, faults_file: Path | None) -> None:
         raise ConfigError(f"--faults: {kind.no_faults}")
 
 
-def _folder_of(cfg: MissionConfig) -> str:
+def _folder_of(cfg: CommonConfig) -> str:
     text: RunText = kind_of(cfg).text.get()(cfg)
     return text.folder or text.subject
 
 
-def make_run_dir(options: RunOptions, cfg: MissionConfig) -> Path:
+def make_run_dir(options: RunOptions, cfg: CommonConfig) -> Path:
     """The directory of a new run, or of a survey that is resumed with the same points.
 
     ConfigError: options or configuration contradict its content, or it cannot be created.

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.links.topics import MissionStatus
 
 
@@ -37,7 +37,7 @@ def progress_text(status: MissionStatus, state: str, rest: str) -> str:
     return f"{state} {status.point}".strip() + f", {clock(status.elapsed_s)} elapsed, {rest}"
 
 
-def plain_text(cfg: MissionConfig) -> RunText:
+def plain_text(cfg: CommonConfig) -> RunText:
     """The texts of a kind of mission that has none of its own."""
 
     def title(is_sim: bool) -> str:

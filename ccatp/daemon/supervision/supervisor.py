@@ -17,7 +17,7 @@ import zmq
 
 from ccatp.config.files import read_toml, write_durably
 from ccatp.config.load import dump_config, load_config, load_mission
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.daemon.operator.alarms import AlarmList
 from ccatp.daemon.operator.terminal import STOP_SIGNALS, RunView, import_drawing, write_run_report
 from ccatp.daemon.operator.webhook import AlarmWebhook
@@ -323,7 +323,7 @@ def run_survey(options: RunOptions) -> int:
     return _run(options, load_config(options.config_file, dict(options.overrides), any_ports=options.sim))
 
 
-def _run(options: RunOptions, cfg: MissionConfig, fork_server: ForkServer | None = None) -> int:
+def _run(options: RunOptions, cfg: CommonConfig, fork_server: ForkServer | None = None) -> int:
     options = with_origin(options)
     permit_open_files()
     kind = kind_of(cfg)
@@ -371,7 +371,7 @@ def _run(options: RunOptions, cfg: MissionConfig, fork_server: ForkServer | None
         return SupervisedRun(options, context, sockets, page, forks, started_s=started_s).run()
 
 
-def _addresses(cfg: MissionConfig) -> dict[str, dict[str, object]]:
+def _addresses(cfg: CommonConfig) -> dict[str, dict[str, object]]:
     """Host and port of each peer and of the page."""
     sections = {"robot": cfg.robot, "etalon": getattr(cfg, "etalon", None)}
     sections["dashboard"] = cfg.dashboard if cfg.dashboard.enabled else None

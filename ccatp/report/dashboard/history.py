@@ -215,7 +215,7 @@ class LogEntry(msgspec.Struct):
 _entry = msgspec.json.Decoder(LogEntry)
 
 
-class RunFiles:
+class RunFollower:
     """Follows the log of a run, whose messages go to ``lines``, and the file of its emergencies.
 
     ``started``: when the run began, UTC in ISO format, empty while that is not known; ``emergencies``: those that are

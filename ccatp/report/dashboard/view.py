@@ -17,7 +17,7 @@ from ccatp.links import topics
 from ccatp.links.liveness import Liveness
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import BY_NAME, Heartbeat, MissionStatus, TruthBatch
-from ccatp.report.dashboard.history import GAP_S, Growing, Lines, RunFiles, Trail, TruthCompare
+from ccatp.report.dashboard.history import GAP_S, Growing, Lines, RunFollower, Trail, TruthCompare
 from ccatp.survey.turn import is_under_way, turn_text
 
 LOOPS = ("main", "danger")
@@ -177,7 +177,7 @@ class RunStateView:
         self._trail = Trail(MAX_PATH, GAP_S)
         self._series = {name: Growing(MAX_SAMPLES, GAP_S if name in set(lines) else inf) for name in series}
         self._lines = Lines(MAX_LINES)
-        self._files = RunFiles(run_dir, self._lines)
+        self._files = RunFollower(run_dir, self._lines)
         self.read_files, self.close = self._files.read, self._files.close
         self._states = [PLANNED] * points
         self._errors_mm: list[float | None] = [None] * points

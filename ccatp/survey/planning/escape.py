@@ -9,7 +9,7 @@ from ccatp.config.models import LimitsConfig, MissionConfig
 from ccatp.core import DeckPose, FloatArray, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import (
-    Body,
+    Footprint,
     LegPlace,
     UnreachablePointError,
     course_of_heading,
@@ -29,7 +29,7 @@ _ROUNDING_M = 1e-6
 _MILLIMETRE_M = 1e-3
 
 
-def find_escape(mirror: Mirror, body: Body, start: SearchNode, limits: LimitsConfig) -> SearchNode:
+def find_escape(mirror: Mirror, body: Footprint, start: SearchNode, limits: LimitsConfig) -> SearchNode:
     """The best single turn and straight leg, forward or in reverse, to a place where the robot can turn freely.
 
     It brings no sensor nearer to the rim than ``turn_clearance_m``, or than it is already. If every motion does so, the
@@ -80,7 +80,7 @@ _SLANTS_RAD = np.radians([0, 2, -2, 4, -4, 6, -6, 8, -8, 10, -10, 12, -12, 14, -
 _COURSES_RAD = np.radians([0, 90, 180, 270])[:, None] + _SLANTS_RAD  # (sides, slants)
 
 
-def find_turning_places(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
+def find_turning_places(mirror: Mirror, body: Footprint, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
     """For each place where the robot cannot turn freely, the nearest places around it where it can; else none.
 
     At most one in each direction of the grid of panels, straight or slightly slanted (for a place in a corner, or to
@@ -99,7 +99,7 @@ def find_turning_places(mirror: Mirror, body: Body, places: list[LegPlace]) -> l
     return found
 
 
-def _nearest(place: LegPlace, body: Body, depths: FloatArray, courses_rad: FloatArray) -> LegPlace | None:
+def _nearest(place: LegPlace, body: Footprint, depths: FloatArray, courses_rad: FloatArray) -> LegPlace | None:
     faced = np.array([place.can_face(course) or place.can_face(course + pi) for course in courses_rad.tolist()])
     is_good = (depths >= body.turning_depth_m) & faced[:, None] & (body.shortest_move_m <= _AWAY_M)
     if not is_good.any():
@@ -117,7 +117,7 @@ _STEP_M = 0.02
 _BESIDE_M = 0.03  # largest distance from its line at which a drive can continue
 
 
-def plan_calibration(mirror: Mirror, body: Body, mission: MissionConfig, base: DeckPose) -> tuple[Stop, ...]:
+def plan_calibration(mirror: Mirror, body: Footprint, mission: MissionConfig, base: DeckPose) -> tuple[Stop, ...]:
     """Rounds of four legs between base and a place behind or before it; they end at base with the heading of the start.
 
     The robot drives forth and back along a line twice, with opposite headings. A wrong heading shifts the two ends

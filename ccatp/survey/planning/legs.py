@@ -68,7 +68,7 @@ class LegPlace:
         return self.blocked[last + 1] == self.blocked[first]
 
 
-class Body(NamedTuple):
+class Footprint(NamedTuple):
     """The edge sensors in the robot frame, (4, 2), the distance of the furthest, and the clearances, m.
 
     ``shortest_move_m``: least length of the leg from the place of the turn to a point at the rim.
@@ -86,15 +86,17 @@ class Body(NamedTuple):
         return max(self.reach_m + self.turn_clearance_m, self.leg_clearance_m) + _SPARE_M
 
 
-def build_body(robot: RobotConfig, mission: MissionConfig) -> Body:
+def build_body(robot: RobotConfig, mission: MissionConfig) -> Footprint:
     """The robot's body and clearances from the configuration."""
     reach_m = max(hypot(x, y) for x, y in robot.edge_sensors_m)
     shortest_m = max(_SHORTEST_MOVE_M, _SHORTEST_MOVE_TYRES * robot.tyre_m)
     sensors_m = np.array(robot.edge_sensors_m)
-    return Body(sensors_m, reach_m, mission.leg_clearance_m, mission.turn_clearance_m, shortest_m)
+    return Footprint(sensors_m, reach_m, mission.leg_clearance_m, mission.turn_clearance_m, shortest_m)
 
 
-def sensor_depths(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray, courses_rad: FloatArray) -> FloatArray:
+def sensor_depths(
+    mirror: Mirror, body: Footprint, xs: FloatArray, ys: FloatArray, courses_rad: FloatArray
+) -> FloatArray:
     """Distance to the rim of the sensor nearest to it, m (< 0 beyond), of a robot at (x, y) facing a course.
 
     The arrays are broadcast. The robot lies in the tangent plane, and its sensors are projected on the deck: with the
@@ -112,7 +114,7 @@ def sensor_depths(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray, co
     return np.asarray(mirror.rim.signed_distances_m(px, py).min(axis=-1), dtype=np.float64)
 
 
-def build_places(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray) -> list[LegPlace]:
+def build_places(mirror: Mirror, body: Footprint, xs: FloatArray, ys: FloatArray) -> list[LegPlace]:
     """Places at deck coordinates of shape (n,), m, with the blocked courses of those near the rim."""
     depths = mirror.rim.signed_distances_m(xs, ys)
     near = np.flatnonzero(depths < body.turning_depth_m)
@@ -150,7 +152,7 @@ _GRAZING_M = (0.0, 0.4, 4.0)  # accepted detour to avoid each
 class LegRules:
     """Decides which straight legs the robot may drive."""
 
-    def __init__(self, mirror: Mirror, body: Body) -> None:
+    def __init__(self, mirror: Mirror, body: Footprint) -> None:
         self._rim, self._body = mirror.rim, body
         self._sensors: list[list[float]] = body.sensors_m.tolist()
         self._corners, self._nodes = _reentrant_corners(mirror, body)
@@ -293,7 +295,7 @@ def _seam_lines(mirror: Mirror) -> tuple[list[float], list[float]]:
     return sorted(xs), sorted(ys)
 
 
-def _reentrant_corners(mirror: Mirror, body: Body) -> tuple[list[tuple[float, float]], list[LegPlace]]:
+def _reentrant_corners(mirror: Mirror, body: Footprint) -> tuple[list[tuple[float, float]], list[LegPlace]]:
     """Corners of the rim at which the mirror has 270 degrees, and for each the place inset by the clearance."""
     vertices = [(float(x), float(y)) for x, y in mirror.rim.vertices]
     corners, nodes = [], []

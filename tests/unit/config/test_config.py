@@ -24,7 +24,7 @@ from ccatp.config.load import (
     with_values,
 )
 from ccatp.config.messages import find_line
-from ccatp.config.mission import MissionConfig
+from ccatp.config.mission import CommonConfig
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
@@ -586,7 +586,7 @@ def test_keys_that_have_moved_mean_what_they_meant(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("load", [load_config, load_radio_config])
 def test_the_time_after_which_a_frame_is_late_has_been_named_after_a_slip(
-    load: Callable[..., MissionConfig], tmp_path: Path
+    load: Callable[..., CommonConfig], tmp_path: Path
 ) -> None:
     file = tmp_path / "old.toml"
     file.write_text("[robot]\nslip_after_s = 0.03\n")

@@ -2,8 +2,8 @@
 
 CCATP_PROFILE names the folder that takes the samples of the processes, CCATP_FRAME_PACKAGE the folder of the package. A
 timer of CPU time interrupts the main thread: unlike a tracing profiler it costs a call no more than it takes. Each
-sample weighs the CPU time of the main thread since the one before, so that they add up to it. A fork of a process begins
-its own samples: it inherits neither the timer nor the CPU time.
+sample weighs the CPU time of the main thread since the one before, so that they add up to it. A fork of a process
+begins its own samples, because it inherits neither the timer nor the CPU time.
 """
 
 import atexit

@@ -14,7 +14,7 @@ from ccatp.kinematics import bearing, difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.escape import find_turning_places
 from ccatp.survey.planning.legs import (
-    Body,
+    Footprint,
     LegPlace,
     OutsideMirrorError,
     UnreachablePointError,
@@ -36,15 +36,15 @@ from ccatp.survey.planning.tour_bound import tour_bound
 from tests.support.scenario import world_of
 
 
-def body_of(world: Any) -> Body:
+def body_of(world: Any) -> Footprint:
     return build_body(world.cfg.robot, world.cfg.mission)
 
 
-def place(mirror: Mirror, body: Body, x: float, y: float) -> LegPlace:
+def place(mirror: Mirror, body: Footprint, x: float, y: float) -> LegPlace:
     return build_places(mirror, body, np.array([x]), np.array([y]))[0]
 
 
-def at(mirror: Mirror, body: Body, point: PointId) -> LegPlace:
+def at(mirror: Mirror, body: Footprint, point: PointId) -> LegPlace:
     return place(mirror, body, *mirror.point_on_deck(point))
 
 
