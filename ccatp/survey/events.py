@@ -91,7 +91,7 @@ class StopHere(NamedTuple):
 
 
 class Interrupted(NamedTuple):
-    """Frames or verdicts are not fresh: hold until they are."""
+    """The loop or the link has found something: hold, go home or only report it, as its row says."""
 
     cause: Cause
 

@@ -33,7 +33,7 @@ from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.composition import SurveyParts
-from ccatp.survey.events import Abort, Fault, Mode, SurveyOutcome, TrackingGap
+from ccatp.survey.events import Fault, Interrupted, Mode, SurveyOutcome, TrackingGap
 from ccatp.survey.fix_gate import FixGate
 from ccatp.survey.forecast import forecast_time
 from ccatp.survey.laser_follow import LaserFollow
@@ -259,7 +259,7 @@ class SurveyRunner(MissionRunner):
                 "error", f"held for {held_s:.0f} s, waiting for an operator: {text_of(mission.state.cause)}"
             )
         elif action is FaultAction.RETURN:
-            mission.handle(Abort(UNATTENDED_FAULT.cause(charge=sensors.soc)))
+            mission.handle(Interrupted(UNATTENDED_FAULT.cause(charge=sensors.soc)))
 
     def execute(self, command: MissionCommand, motion: StateEstimate) -> None:
         mission, seq = self.mission, self._clock.seq

@@ -18,7 +18,7 @@ from ccatp.conditions import (
     Motion,
     Owner,
 )
-from ccatp.conditions.mission import NO_VERDICT, STUCK_AT_EDGE
+from ccatp.conditions.mission import NO_VERDICT, STUCK_AT_EDGE, UNATTENDED_FAULT
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.loops.mission_runner import LoopLimits, MissionRunner
@@ -238,6 +238,8 @@ def met(row: Condition, config: Config, mirror: Mirror) -> tuple[SurveyState, Su
         case Owner.LOCALIZER:
             story.mission.handle(EstimateDiverged(cause, story.t))
         case Owner.LINK | Owner.MAIN:
+            story.mission.handle(Interrupted(cause))
+        case Owner.MISSION if row is UNATTENDED_FAULT:  # the loop watches the battery
             story.mission.handle(Interrupted(cause))
         case _:
             return before, story.mission.survey.meet(before, cause)
