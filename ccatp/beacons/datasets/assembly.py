@@ -85,11 +85,9 @@ def _usable(kind: str, table: Table, warnings: list[str]) -> Table:
 def _check_complete(recording: Recording) -> None:
     file, tables = recording.file, recording.tables
     if not any(kind in tables for kind in MOTIONS):
-        raise RadioDataError(file, f"no event odom ({', '.join(EVENTS['odom'])}); see docs/radio_data.md")
+        raise RadioDataError(file, f"no event odom ({', '.join(EVENTS['odom'])})")
     if not any(kind in tables for kind in READING_KINDS):
-        raise RadioDataError(
-            file, f"no readings of beacons: no event {', '.join(READING_KINDS)}; see docs/radio_data.md"
-        )
+        raise RadioDataError(file, f"no readings of beacons: no event {', '.join(READING_KINDS)}")
 
 
 def _motions(recording: Recording, tables: dict[str, Table]) -> Table:
@@ -167,7 +165,7 @@ def _check_steps(odometry: Table) -> None:
             raise RadioDataError(
                 odometry.file,
                 f"odometry: {what} of {values[at]:.3g} {unit} at {odometry.values[at + 1, 0]:.6g} s cannot be; at most "
-                f"{most:g} is taken; see the units in docs/radio_data.md",
+                f"{most:g} is taken",
                 int(odometry.lines[at + 1]),
             )
 

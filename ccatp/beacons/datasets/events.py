@@ -10,6 +10,7 @@ from ccatp.beacons.datasets.tables import (
     RadioDataError,
     Table,
     content_lines,
+    delimiter_of,
     is_number,
     read_text,
     split_cells,
@@ -70,10 +71,17 @@ def surveyed(places: Table, names: tuple[str, ...]) -> tuple[tuple[str, ...], Ta
 
 def is_events_csv(text: str) -> bool:
     """Whether the first line of a text is an event or the header, or the second line, if the first has only words."""
-    lines = [split_cells(content) for _, content in content_lines(text[:4096])[:2]]
+    lines = [cells for _, cells in _rows(text[:4096])[:2]]
     if lines and not any(is_number(cell) for cell in lines[0]):
         return any(cells[0] in (*EVENTS, HEADER) for cells in lines)
     return bool(lines) and lines[0][0] in EVENTS
+
+
+def _rows(text: str) -> list[tuple[int, list[str]]]:
+    """Line number and cells of each line; the first line tells the delimiter."""
+    lines = content_lines(text)
+    delimiter = delimiter_of(lines[0][1]) if lines else None
+    return [(line, split_cells(content, delimiter)) for line, content in lines]
 
 
 def read_events_csv(file: Path) -> Recording:
@@ -82,8 +90,7 @@ def read_events_csv(file: Path) -> Recording:
         raise RadioDataError(file, "is a folder: name the CSV file in it")
     numbers: dict[str, float] = {}
     rows: list[tuple[str, int, list[float]]] = []
-    for line, content in content_lines(read_text(file)):
-        cells = split_cells(content)
+    for line, cells in _rows(read_text(file)):
         is_head = not rows and cells[0] not in EVENTS and not any(is_number(cell) for cell in cells[1:])
         if cells[0] != HEADER and not is_head:
             rows.append(tagged_row(file, line, cells, EVENTS, numbers))

@@ -39,7 +39,7 @@ def read_pyfg(file: Path) -> Recording:
     warnings: list[str] = []
     vehicles = [match[1] for _, kind, _, names, _ in lines if kind == "EDGE_SE2" and (match := POSE.match(names[0]))]
     if not vehicles:
-        raise RadioDataError(file, "has no odometry: no EDGE_SE2 between poses; see docs/radio_data.md")
+        raise RadioDataError(file, "has no odometry: no EDGE_SE2 between poses")
     vehicle = max(set(vehicles), key=vehicles.count)
     if len(set(vehicles)) > 1:
         warnings.append(f"of the vehicles {', '.join(sorted(set(vehicles)))} only {vehicle} is read")

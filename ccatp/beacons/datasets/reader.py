@@ -45,11 +45,14 @@ def read_run(
     data_format = found_format(path, data_format)
     if robot is not None and data_format != "mrclam":
         raise RadioDataError(path, f"a {data_format} set has one vehicle: leave out --robot")
-    if data_format == "mrclam":
-        recording = read_mrclam(path, robot)
-    else:
-        recording = read_bag(path, topics_file) if data_format == "bag" else READERS[data_format](path)
-    return checked_run(recording, turns_heading=turns_heading)
+    try:
+        if data_format == "mrclam":
+            recording = read_mrclam(path, robot)
+        else:
+            recording = read_bag(path, topics_file) if data_format == "bag" else READERS[data_format](path)
+        return checked_run(recording, turns_heading=turns_heading)
+    except RadioDataError as error:
+        raise error.with_page() from error
 
 
 def found_format(path: Path, given: str | None = None) -> str:
@@ -61,6 +64,13 @@ def found_format(path: Path, given: str | None = None) -> str:
         raise RadioDataError(path, "no such file or folder")
     if given is not None:
         return given
+    try:
+        return _detected(path)
+    except RadioDataError as error:
+        raise error.with_page() from error
+
+
+def _detected(path: Path) -> str:
     is_folder = path.is_dir()
     files = [file for file in sorted(path.iterdir()) if file.is_file()] if is_folder else [path]
     if path.suffix in BAGS or any(file.name == "metadata.yaml" for file in files):
@@ -81,9 +91,7 @@ def found_format(path: Path, given: str | None = None) -> str:
             return "csv"
         if is_pyfg(text):
             return "pyfg"
-    raise RadioDataError(
-        path, f"none of the formats {', '.join(FORMATS)}; if it is one, name it with --format; see docs/radio_data.md"
-    )
+    raise RadioDataError(path, f"none of the formats {', '.join(FORMATS)}; if it is one, name it with --format")
 
 
 def _texts_beside_others(files: Sequence[Path]) -> list[str]:

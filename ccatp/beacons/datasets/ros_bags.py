@@ -94,9 +94,7 @@ def read_bag(path: Path, topics_file: Path | None) -> Recording:
     Raises RadioDataError: rosbags is not installed, or the bag or its topics are invalid.
     """
     if topics_file is None:
-        raise RadioDataError(
-            path, "is a bag: give a TOML file that names its topics with --topics; see docs/radio_data.md"
-        )
+        raise RadioDataError(path, "is a bag: give a TOML file that names its topics with --topics")
     topics, warnings = read_topics(topics_file), list[str]()
     found = _read(path, topics, warnings)
     tag = _chosen_tag(path, topics, found, warnings)
@@ -134,7 +132,7 @@ def read_topics(file: Path) -> Topics:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise RadioDataError(file, f"{where}: {first['msg'].lower()}; see docs/radio_data.md") from error
+        raise RadioDataError(file, f"{where}: {first['msg'].lower()}") from error
     except OSError as error:
         raise RadioDataError(file, f"cannot be read: {error.strerror or error}") from error
     except ValueError as error:

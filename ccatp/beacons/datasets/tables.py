@@ -1,8 +1,10 @@
 """Tables of numbers in text files, plain or gzipped; errors name file and line; checks of order and completeness."""
 
+import codecs
 import csv
 import gzip
 import io
+import re
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -24,15 +26,25 @@ class RadioDataError(CcatpError):
     def __init__(self, where: Path | str, problem: str, line: int | None = None) -> None:
         super().__init__(f"{where}:{line}: {problem}" if line is not None else f"{where}: {problem}")
 
+    def with_page(self) -> "RadioDataError":
+        """The same, and that ``PAGE`` describes what can be read."""
+        self.args = (f"{self} (see {PAGE})",)
+        return self
+
 
 class NotTextError(RadioDataError):
     """A file that is not text."""
 
 
+PAGE = "docs/radio_data.md"
 MOST_DATA_BYTES = 50_000_000  # against decompression bombs; the longest known recording has 10 MB
 LONGEST_ROW = 20_000  # characters
 GZIP_MAGIC = b"\x1f\x8b"
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")  # bytes that no text of one byte a character has
 COMMENTS = ("#", "%", "//")
+DELIMITERS = ";\t,"  # of cells, in this order: beside another one, a comma is the decimal mark
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 UNOMITTABLE = ("time_s", "time [s]", "x_m", "y_m", "forward_m", "left_m")  # columns that no cell may leave empty
 GAP_S = 2.0  # shorter pauses are normal for recorders,
 GAP_RATIO = 20.0  # and so are pauses of fewer usual intervals
@@ -48,8 +60,8 @@ def listed(names: Sequence[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam, labyrinth or csv") -> str:
-    """The text of a file; a gzipped file, of any name, is unpacked.
+def read_text(file: Path, wanted: str = "a recording as text, or a ROS bag") -> str:
+    """The text of a file: UTF-8, UTF-16 with its mark, or Windows-1252; a gzipped file, of any name, is unpacked.
 
     Raises RadioDataError: it is missing, cannot be read, is too long, or is not text.
     """
@@ -59,7 +71,7 @@ def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam
             data = gzip.GzipFile(fileobj=io.BytesIO(data)).read(MOST_DATA_BYTES + 1)
             if len(data) > MOST_DATA_BYTES:
                 raise RadioDataError(file, f"holds more than {MOST_DATA_BYTES} bytes once unpacked")
-        text = data.decode("utf-8-sig")
+        text = _decoded(data)
     except FileNotFoundError as error:
         raise RadioDataError(file, "no such file") from error
     except (OSError, EOFError, zlib.error) as error:
@@ -67,11 +79,24 @@ def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam
     except UnicodeDecodeError as error:
         raise NotTextError(file, f"is not text; give {wanted}") from error
     for line, content in enumerate(text.splitlines(), 1):
+        if "\0" in content:
+            raise NotTextError(file, f"is not text; give {wanted}", line)  # NUL characters, as after a power cut
         if len(content) > LONGEST_ROW:
             raise RadioDataError(
                 file, f"has {len(content)} characters, at most {LONGEST_ROW} are taken; give {wanted}", line
             )
     return text
+
+
+def _decoded(data: bytes) -> str:
+    if data.startswith(UTF_16):
+        return data.decode("utf-16")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        if CONTROL.search(data):
+            raise
+        return data.decode("cp1252")
 
 
 def content_lines(text: str) -> list[tuple[int, str]]:
@@ -80,11 +105,22 @@ def content_lines(text: str) -> list[tuple[int, str]]:
     return [(number, line) for number, line in stripped if line and not line.startswith(COMMENTS)]
 
 
+def delimiter_of(content: str) -> str | None:
+    """The delimiter of the cells of a line; ``None`` for white space."""
+    return next((mark for mark in DELIMITERS if mark in content), None)
+
+
 def split_cells(content: str, delimiter: str | None = ",") -> list[str]:
-    """The stripped cells of a line, quoted or not; split at white space if ``delimiter`` is ``None``."""
+    """The stripped cells of a line, quoted or not; split at white space if ``delimiter`` is ``None``.
+
+    Where the delimiter is no comma, numbers may have a decimal comma, and get a point.
+    """
     if delimiter is None:
         return content.split()
-    return [cell.strip() for cell in next(csv.reader([content], delimiter=delimiter, skipinitialspace=True))]
+    cells = [cell.strip() for cell in next(csv.reader([content], delimiter=delimiter, skipinitialspace=True))]
+    if delimiter == "," or "," not in content:
+        return cells
+    return [cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
 
 
 def number(file: Path, line: int, text: str, what: str) -> float:
@@ -182,7 +218,7 @@ def tagged_row(
     """
     kind, *cells = words
     if kind not in layout:
-        raise RadioDataError(file, f"{kind!r} is none of {', '.join(layout)}", line)
+        raise RadioDataError(file, f"{kind[:40]!r} is none of {', '.join(layout)}", line)
     columns = layout[kind]
     while len(cells) > max(1, needed_of(columns)) and not cells[-1]:
         cells.pop()  # empty cells at the end, as spreadsheets write them

@@ -62,7 +62,7 @@ def sets_in(folder: str) -> Mapping[str, RecordedSet]:
             return {name_of(path.resolve()): own}
         found[name_of(path)] = own
     if not found:
-        raise CampaignError(f"--data {folder}: holds no recording ({reason}); see docs/radio_data.md")
+        raise CampaignError(f"--data {folder}: holds no recording ({reason})")
     return found
 
 

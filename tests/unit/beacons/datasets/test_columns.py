@@ -1,6 +1,7 @@
 """Tables with headers and factor graphs give the run that the CSV of events gives."""
 
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,32 @@ def wide_form(folder: Path) -> Path:
     return folder
 
 
+def with_decimal_commas(folder: Path) -> Path:
+    write_lines(folder / "uwb.csv", lines_of("time,anchor,range", RANGES, ";"))
+    long_form(folder)
+    for file in folder.iterdir():
+        text = file.read_text(encoding="utf-8").replace(",", ";").replace(".", ",")
+        file.write_bytes(text.replace("\n", "\r\n").encode("utf-16"))
+    return folder / "uwb.csv"
+
+
+def as_pandas_writes(folder: Path) -> Path:
+    long_form(folder)
+    begin = datetime(1970, 1, 1, tzinfo=UTC)
+    rows = [(k, (begin + timedelta(seconds=t)).isoformat(" "), name, r, 0.1) for k, (t, name, r) in enumerate(RANGES)]
+    lines = [f'{k},"{t}","{name}",{r},{sigma}' for k, t, name, r, sigma in rows]
+    return write_lines(folder / "uwb.csv", ['"ID","Time","Anchor ID","Range (m)","Range Std (m)"', *lines])
+
+
+def as_evo_writes(folder: Path) -> Path:
+    long_form(folder)
+    (folder / "odometry.csv").unlink()
+    lines = [f"{t} {x} {y} 0 0 0 {2.0 * np.sin(0.5 * h)} {2.0 * np.cos(0.5 * h)}" for t, x, y, h in POSES]
+    write_lines(folder / "odometry.txt", ["# timestamp tx ty tz qx qy qz qw", *lines])
+    rows = [(t, *(r if name == one else "NaN" for one in NAMES)) for t, name, r in RANGES]
+    return write_lines(folder / "uwb.csv", lines_of("# time," + ",".join(f"dist_{name}" for name in NAMES), rows))
+
+
 def as_graph(folder: Path) -> Path:
     run = read_run(write_lines(folder / "run.csv", csv_lines(W)), None, None)
     lines = pyfg_lines(run, load_recordings_config().csv, np.column_stack(run.truth[1:]) if run.truth else W.poses)
@@ -53,7 +80,9 @@ def as_graph(folder: Path) -> Path:
     return write_lines(folder / "graph.pyfg", lines)
 
 
-@pytest.mark.parametrize("make", [long_form, in_units, wide_form, as_graph])
+@pytest.mark.parametrize(
+    "make", [long_form, in_units, wide_form, with_decimal_commas, as_pandas_writes, as_evo_writes, as_graph]
+)
 def test_the_same_run_comes_from_tables_and_from_a_graph(make: Callable[[Path], Path], tmp_path: Path) -> None:
     found = read_run(make(tmp_path), None, None)
     np.testing.assert_allclose(np.sort(found.readings.range_m), np.sort(W.range_m), atol=1e-7)
@@ -66,6 +95,11 @@ def test_the_same_run_comes_from_tables_and_from_a_graph(make: Callable[[Path], 
     assert found.kind == "csv"
 
 
+def rewritten(folder: Path, *lines: str) -> Path:
+    """The table of readings with other lines."""
+    return write_lines(folder / "uwb.csv", [*lines])
+
+
 @pytest.mark.parametrize(
     ("change", "what"),
     [
@@ -73,6 +107,13 @@ def test_the_same_run_comes_from_tables_and_from_a_graph(make: Callable[[Path], 
         (lambda folder: write_lines(folder / "odometry.csv", ["time,x,y", "0,0,0"]), "x and y has no heading"),
         (lambda folder: write_lines(folder / "odometry.csv", ["time,x,y,yaw", "0,a,0,0"]), "csv:2: x is 'a'"),
         (lambda folder: write_lines(folder / "odometry.csv", ["time,x,y,yaw"]), "holds no rows below its header"),
+        (lambda folder: rewritten(folder, "time,anchor,range"), "holds no rows below"),
+        (lambda folder: rewritten(folder, "time,anchor,range,dist", "1,A,2,3"), "csv:1: several columns of a range"),
+        (lambda folder: rewritten(folder, "time,id,range_raw", "1,A,2"), "csv:1: no column of a range"),
+        (lambda folder: rewritten(folder, "time,id,range", "1,A,2,3"), "csv:2: 4 cells below a header of 3"),
+        (lambda folder: rewritten(folder, "time,id,range", ",A,2"), "csv:2: the reading has no time"),
+        (lambda folder: rewritten(folder, "time,id,range", "1,,2"), "csv:2: the reading has no name"),
+        (lambda folder: rewritten(folder, "time,id,range", "noon,A,2"), "csv:2: time is 'noon', not a number"),
         (lambda folder: write_lines(folder / "more.csv", ["time,x,y,yaw", "0,0,0,0"]), "has 2 tables of odometry"),
     ],
 )  # fmt: skip
@@ -81,8 +122,14 @@ def test_a_table_that_is_missing_or_wrong_is_one_line(
 ) -> None:
     file = long_form(tmp_path)
     change(tmp_path)
-    with pytest.raises(RadioDataError, match=what):
+    with pytest.raises(RadioDataError, match=rf"{what}.*\(see docs/radio_data\.md\)$"):
         read_run(file, None, None)
+
+
+def test_a_table_without_a_header_is_none_though_its_format_is_given(tmp_path: Path) -> None:
+    file = write_lines(tmp_path / "uwb.csv", ["1,A,2", "2,A,3"])
+    with pytest.raises(RadioDataError, match="has no header with a time and ranges"):
+        read_run(file, "columns", None)
 
 
 @pytest.mark.parametrize(

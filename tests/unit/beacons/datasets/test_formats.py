@@ -69,6 +69,18 @@ def _quoted(folder: Path) -> Path:
     return write_lines(folder / "mine.csv", [*lines])
 
 
+def _european(folder: Path) -> Path:
+    text = "\r\n".join(csv_lines(W)).replace(",", ";").replace(".", ",")
+    (folder / "mine.csv").write_bytes(f"# Winkel gegen Norden in \xb0\r\n{text}".encode("cp1252"))
+    return folder / "mine.csv"
+
+
+def _wide(folder: Path) -> Path:
+    text = "\n".join(csv_lines(W)).replace(",", "\t")
+    (folder / "mine.csv").write_bytes(text.encode("utf-16"))
+    return folder / "mine.csv"
+
+
 # What writes the run, its name, whether it has bearings, and whether the first heading is the truth's or that which the
 # first two metres of positions tell.
 WAYS: dict[str, tuple[Callable[[Path], Path], str, bool, bool]] = {
@@ -84,6 +96,8 @@ WAYS: dict[str, tuple[Callable[[Path], Path], str, bool, bool]] = {
     "csv": (lambda folder: write_lines(folder / "mine.csv", csv_lines(W)), "mine", True, True),
     "csv with a head": (lambda folder: write_lines(folder / "b.txt", ["t,x,y", *csv_lines(W)]), "b", True, True),
     "csv quoted": (_quoted, "mine", True, True),
+    "csv with decimal commas in Windows-1252": (_european, "mine", True, True),
+    "csv with tabs in UTF-16": (_wide, "mine", True, True),
 }
 
 
@@ -308,7 +322,7 @@ def _two_labyrinths(folder: Path) -> Path:
 
 def test_a_file_that_is_not_text_does_not_hide_the_format_of_its_folder(tmp_path: Path) -> None:
     write_lines(tmp_path / "a_0.txt", labyrinth_lines(W_SHORT))
-    (tmp_path / "0.csv").write_bytes(b"\xff\xfe\x00\x81")
+    (tmp_path / "0.csv").write_bytes(b"\xff\xfe\x00\xd8")
     assert found_format(tmp_path) == "labyrinth"
     with pytest.raises(RadioDataError, match="is not text"):
         found_format(tmp_path / "0.csv")
@@ -348,7 +362,9 @@ FAULTS: list[tuple[Make, str | None, str]] = [
     (lambda folder: folder / "missing", None, r"missing: no such file or folder$"),
     (_folder, None, r"none of the formats plaza, mrclam, labyrinth, csv"),
     (_text("hello, world", "1 2 3"), None, r"data\.txt: none of the formats"),
-    (_bytes("data.bin", b"\xff\xfe\x00\x81"), None, r"data\.bin: is not text"),
+    (_bytes("data.bin", b"\xff\xfe\x00\xd8"), None, r"data\.bin: is not text"),
+    (_bytes("data.csv", b"odom,0,0,0\nodom,1,0\0\0\0\0"), None, r"data\.csv:2: is not text"),
+    (_bytes("data.xlsx", b"PK\x03\x04\x81\x00"), None, r"data\.xlsx: is not text; give a recording as text, or a ROS"),
     (_bytes("part.txt.gz", CUT), None, r"part\.txt\.gz: cannot be read: .*end-of-stream"),
     (_folder, "csv", r"is a folder: name the CSV file in it"),
     (_folder, "plaza", r"holds no Plaza set: neither NAME\.mat nor NAME_DR\.txt"),
@@ -424,7 +440,7 @@ def test_a_fault_is_one_line(tmp_path: Path, make: Make, data_format: str | None
 
 def test_a_robot_that_is_not_there(tmp_path: Path) -> None:
     write_mrclam(tmp_path, W_SHORT, robot=2)
-    with pytest.raises(RadioDataError, match=r"has no odometry of robot 1; there are 2$"):
+    with pytest.raises(RadioDataError, match=r"has no odometry of robot 1; there are 2 \(see docs/radio_data\.md\)$"):
         read_run(tmp_path, None, 1)
     with pytest.raises(RadioDataError, match=r"a plaza set has one vehicle: leave out --robot"):
         read_run(write_plaza(tmp_path, W_SHORT), None, 1)
