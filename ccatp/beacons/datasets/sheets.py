@@ -17,7 +17,15 @@ import tomlkit
 from ccatp.beacons.cricket.measured_map import MeasuredRanges
 from ccatp.beacons.cricket.range_network import MoteRange
 from ccatp.beacons.datasets.placeholders import placeholder_values
-from ccatp.beacons.datasets.tables import RadioDataError, content_lines, number, plural, read_text, split_cells
+from ccatp.beacons.datasets.tables import (
+    RadioDataError,
+    content_lines,
+    delimiter_of,
+    number,
+    plural,
+    read_text,
+    split_cells,
+)
 from ccatp.beacons.estimation.level_fix import MeasuredPlace
 from ccatp.beacons.estimation.path_loss import LevelPair
 from ccatp.config.files import read_input
@@ -84,7 +92,7 @@ def read_sheet(path: Path, sheet: str | None = None) -> Sheet:
     else:
         name = path.name
         lines = content_lines(read_text(path, "a CSV file or an .xlsx workbook with columns of levels or ranges"))
-        delimiter = next((mark for mark in ",;\t" if lines and mark in lines[0][1]), None)
+        delimiter = delimiter_of(lines[0][1]) if lines else None
         rows = [(line, split_cells(content, delimiter)) for line, content in lines]
     if len(rows) < 2:
         raise RadioDataError(path, "holds no rows below a head; the first row names the columns")

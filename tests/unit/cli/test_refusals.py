@@ -16,7 +16,7 @@ from tests.unit.beacons.cricket.fields import ALL
 from tests.unit.beacons.datasets.sets import csv_lines, world, write_lines
 
 FILES = {
-    "sheets/rnd.csv": b"\xff\xfe\x00\x81",
+    "sheets/rnd.csv": b"\xff\xfe\x00\xd8",
     "sheets/flat.csv": b"distance_m,rssi_dbm\n1,-60\n2,-50\n3,-40\n",
     "one.csv": b"name,x_m,y_m\nM0,0,0\n",
     "tag.csv": b"name,x_m,y_m\ntag0,0,0\n",
