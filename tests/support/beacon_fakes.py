@@ -355,7 +355,8 @@ class FakePioneer(FakePort):
         body = bytes([0x33 if velocity or turn else 0x32]) + bytes(6)
         body += b"".join((speed & 0xFFFF).to_bytes(2, "little") for speed in speeds)
         body += bytes([round(10 * self.battery_v)])
-        body += bytes([self.stalls[0] | self.bumpers[0] << 1, self.stalls[1] | self.bumpers[1] << 1])
+        front, rear = self.bumpers
+        body += bytes([self.stalls[0] | rear << 1, self.stalls[1] | front << 1])
         body += bytes(2) + (int(self.is_enabled) | 2).to_bytes(2, "little") + b"\x00"
         ranges_m = dict(enumerate(self._sonars_m()))
         shown = {n: r for n, r in ranges_m.items() if self.numbers is None or n in self.numbers}

@@ -55,8 +55,8 @@ def onboard_config(cfg: RadioConfig, **overrides: Any) -> BeaconOnboardConfig:
     return load_beacon_onboard_config(None, settings | {key.replace("__", "."): v for key, v in overrides.items()})
 
 
-class BeaconRig:
-    """All fakes in the world of a configuration, and the devices of the program on them."""
+class BeaconBench:
+    """All fakes in the world of a configuration."""
 
     def __init__(
         self, cfg: RadioConfig, onboard: BeaconOnboardConfig | None = None, time: FakeTime | None = None
@@ -80,11 +80,6 @@ class BeaconRig:
         ports: dict[str, FakePort] = {base.device: self.base, self.onboard.devices.radio.device: self.radio}
         ports |= {device: self.listeners[name] for name, device in listeners.devices.items() if name in self.listeners}
         self.ports = ports
-        access = BeaconAccess(
-            lambda device, _baud, _key: self.ports[device].open(),
-            self.dish.open_lines, self.dish.open_input, self.time.sleep,
-        )  # fmt: skip
-        self.hardware = BeaconHardware(self.onboard, self.time, access)
 
     def _level(self, name: str) -> float | None:
         return self.world.level(name, self.dish.direction_rad)
@@ -104,6 +99,18 @@ class BeaconRig:
         base = self.onboard.devices.base
         found = dict(zip(base.sonars, self._distances_m, strict=True))
         return [found.get(number, 5.0) for number in range(16)]
+
+
+class BeaconRig(BeaconBench):
+    """The fakes, and the devices of the program on them, in virtual time."""
+
+    def __init__(self, cfg: RadioConfig, onboard: BeaconOnboardConfig | None = None) -> None:
+        super().__init__(cfg, onboard)
+        access = BeaconAccess(
+            lambda device, _baud, _key: self.ports[device].open(),
+            self.dish.open_lines, self.dish.open_input, self.time.sleep,
+        )  # fmt: skip
+        self.hardware = BeaconHardware(self.onboard, self.time, access)
 
 
 class DrivenRobot(BeaconOnboardRobot, SimulatedBeaconRobot):

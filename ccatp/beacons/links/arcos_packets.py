@@ -26,7 +26,8 @@ _MOTORS_ENABLED = 0x0001
 class Standard(NamedTuple):
     """The packet of each cycle; ``sonars``: number and range, mm, of each new reading.
 
-    ``stalls``, ``bumpers``: of the left and the right wheel; of the bumpers at the front and at the rear, as bits.
+    ``stalls``, ``bumpers``: of the left and the right wheel; of the bumpers at the front and at the rear, as bits. The
+    byte with the stall of the left wheel has the bumpers at the rear, that of the right wheel those at the front.
     """
 
     left_mm_s: int
@@ -111,12 +112,12 @@ def parse_standard(packet: bytes) -> Standard | None:
     """A standard packet; None if it is none, or has not all of its sonar readings."""
     if packet[0] not in STANDARD_PACKETS or len(packet) < 1 + _STANDARD.size:
         return None
-    _, _, _, left, right, battery, left_bits, right_bits, _, flags, _, count = _STANDARD.unpack_from(packet, 1)
+    _, _, _, left, right, battery, left_rear, right_front, _, flags, _, count = _STANDARD.unpack_from(packet, 1)
     start = 1 + _STANDARD.size
     if len(packet) < start + count * _READING.size:
         return None
     sonars = tuple(_READING.unpack_from(packet, start + k * _READING.size) for k in range(count))
-    stalls, bumpers = (bool(left_bits & 1), bool(right_bits & 1)), (left_bits >> 1, right_bits >> 1)
+    stalls, bumpers = (bool(left_rear & 1), bool(right_front & 1)), (right_front >> 1, left_rear >> 1)
     return Standard(left, right, 0.1 * battery, stalls, bumpers, bool(flags & _MOTORS_ENABLED), sonars)
 
 

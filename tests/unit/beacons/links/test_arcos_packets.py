@@ -27,19 +27,30 @@ from ccatp.beacons.links.arcos_packets import (
     parse_standard,
 )
 
-# Commands as they stand in public programs for the P3-DX, and in a question about them at answers.ros.org (351531).
+# Commands as bytes in the test test_packet.cpp of ros_arcos (University of Patras, 2015), in a public program for a P3-DX
+# with an HCS12 (StopUltra, SetAcc1, ResetPos), in the class Comms for PeopleBots, and in a question at answers.ros.org
+# (351531). The base answers SYNC0 to SYNC2 with the same packets.
 PUBLISHED = {
     "SYNC0": (format_command(SYNC0), "FA FB 03 00 00 00"),
     "PULSE": (format_command(PULSE), "FA FB 03 00 00 00"),
     "SYNC1": (format_command(SYNC1), "FA FB 03 01 00 01"),
     "OPEN": (format_command(OPEN), "FA FB 03 01 00 01"),
     "SYNC2": (format_command(SYNC2), "FA FB 03 02 00 02"),
-    "sonars off": (format_command(SONAR, 0), "FA FB 06 1C 3B 00 00 1C 3B"),
-    "acceleration": (format_command(SETA, 1000), "FA FB 06 05 3B E8 03 ED 3E"),
-    "deceleration": (format_command(SETA, -1000), "FA FB 06 05 1B E8 03 ED 1E"),
-    "motors off": (format_command(ENABLE, 0), "FA FB 06 04 3B 00 00 04 3B"),
-    "motors on": (format_command(ENABLE, 1), "FA FB 06 04 3B 01 00 05 3B"),
-}
+    "CLOSE, Comms": (format_command(CLOSE), "FA FB 03 02 00 02"),
+    "STOP, Comms": (format_command(29), "FA FB 03 1D 00 1D"),
+    "sonars off, HCS12": (format_command(SONAR, 0), "FA FB 06 1C 3B 00 00 1C 3B"),
+    "acceleration, HCS12": (format_command(SETA, 1000), "FA FB 06 05 3B E8 03 ED 3E"),
+    "deceleration, HCS12": (format_command(SETA, -1000), "FA FB 06 05 1B E8 03 ED 1E"),
+    "motors off, HCS12": (format_command(ENABLE, 0), "FA FB 06 04 3B 00 00 04 3B"),
+    "motors on, HCS12": (format_command(ENABLE, 1), "FA FB 06 04 3B 01 00 05 3B"),
+    "SETO, HCS12: an even count": (format_packet(b"\x07\x3b"), "FA FB 04 07 3B 07 3B"),
+    "HOSTBAUD, ros_arcos": (format_command(50, 3), "FA FB 06 32 3B 03 00 35 3B"),
+    "ARM_POS, ros_arcos": (format_command(77, 3 << 8 | 25), "FA FB 06 4D 3B 19 03 66 3E"),
+    "DIGOUT, ros_arcos": (format_command(30, 0x0A05), "FA FB 06 1E 3B 05 0A 23 45"),
+    "TTY2 TEST, ros_arcos: a single last byte": (
+        format_packet(b"\x2a\x2b\x04TEST"), "FA FB 09 2A 2B 04 54 45 53 54 73 86",
+    ),
+}  # fmt: skip
 # Of the same question: the base ignored them, because their check sums are wrong.
 WRONG = ("FA FB 06 04 3B 01 00 00 40", "FA FB 06 15 3B 20 00 00 70", "FA FB 06 21 3B 01 00 00 5D")
 
@@ -78,12 +89,15 @@ def standard(**changes: object) -> bytes:
     return head + b"".join(struct.pack("<BH", *sonar) for sonar in sonars) + bytes(12)
 
 
+# Nobody has published the bytes of a standard, encoder or configuration packet that this project has found. Layouts as in
+# the tables of the Pioneer 3 manual, and as three independent programs read them: ARIA, p2os, ros_arcos.
 def test_a_standard_packet() -> None:
     found = parse_standard(standard())
     assert found is not None
     assert (found.left_mm_s, found.right_mm_s, found.is_enabled) == (-150, 148, True)
     assert found.battery_v == pytest.approx(12.1)
-    assert (found.stalls, found.bumpers) == ((True, False), (0, 3))
+    # ArModeBumps of ARIA takes the bumpers at the front from the high byte of STALL AND BUMPERS, as p2os does.
+    assert (found.stalls, found.bumpers) == ((True, False), (3, 0))
     assert found.sonars == ((0, 5000), (7, 350))
     none = parse_standard(standard(bits=(0, 1), flags=2, sonars=()))
     assert none is not None

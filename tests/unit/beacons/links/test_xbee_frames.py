@@ -19,31 +19,52 @@ from ccatp.beacons.links.xbee_frames import (
     parse_node,
 )
 
-BEACON = 0x0013A20040522BAA
-# Frames as they are printed in Digi's manuals (S2C Zigbee, S2C 802.15.4, XBee 3 Zigbee) or in public notes about them.
+BEACON, OTHER = 0x0013A20040522BAA, 0x0013A20012345678
+# Frames as printed in Digi's manuals, with their page, and in public questions. Manuals: ZB = XBee/XBee-PRO ZB of 2011,
+# S2C = XBee/XBee-PRO S2C Zigbee (90002002), 802.15.4 = XBee/XBee-PRO S2C 802.15.4 (90001500), 3 = XBee 3 Zigbee,
+# SX = XBee SX 868, 900HP = XBee-PRO 900HP/XSC, SE = XBee/XBee-PRO SE of 2009.
 PUBLISHED = {
-    "S2C, escaping of data": ("7E 00 02 23 11 CB", OtherFrame(0x23)),
-    "notes on API frames, coordinator started": ("7E 00 02 8A 06 6F", ModemStatus(6)),
-    "notes on API frames, answer to MY": ("7E 00 07 88 52 4D 59 00 00 00 7F", AtResponse(0x52, b"MY", 0, b"\0\0")),
-    "S2C, answer to BD": ("7E 00 05 88 01 42 44 00 F0", AtResponse(1, b"BD", 0, b"")),
-    "S2C, transmit status": ("7E 00 07 8B 01 7D 84 00 00 01 71", OtherFrame(0x8B)),
+    "S2C, API operating mode, escaped characters": ("7E 00 02 23 11 CB", OtherFrame(0x23)),
+    "3 p. 256, command BD": ("7E 00 06 08 01 42 44 04 B0 BC", OtherFrame(0x08)),
+    "example-a.com 22074092, command ND": ("7E 00 05 08 01 4E 44 00 64", OtherFrame(0x08)),
+    "802.15.4 p. 117, transmit to 1234": ("7E 00 0B 01 87 12 34 00 54 78 44 61 74 61 EB", OtherFrame(0x01)),
+    "802.15.4 p. 117, broadcast": ("7E 00 0E 01 00 FF FF 00 42 72 6F 61 64 63 61 73 74 6D", OtherFrame(0x01)),
+    "802.15.4 p. 126, transmit status": ("7E 00 03 89 01 00 75", OtherFrame(0x89)),
+    "ZB, S2C, 3 p. 288, transmit status": ("7E 00 07 8B 01 7D 84 00 00 01 71", OtherFrame(0x8B)),
+    "SE p. 93, coordinator started": ("7E 00 02 8A 06 6F", ModemStatus(6)),
+    "DigiMesh 2.4 p. 79, hardware reset": ("7E 00 02 8A 00 75", ModemStatus(0)),
+    "SE p. 93, answer to BD": ("7E 00 05 88 01 42 44 00 F0", AtResponse(1, b"BD", 0, b"")),
+    "manongdao.com 942208, answer to ND of a router without a name": (
+        "7E 00 19 88 02 4E 44 00 17 85 00 13 A2 00 40 B4 50 23 20 00 FF FE 01 00 C1 05 10 1E 19",
+        AtResponse(2, b"ND", 0, bytes.fromhex("17850013A20040B450232000FFFE0100C105101E")),
+    ),
     "S2C, explicit receive": (
         "7E 00 18 91 00 13 A2 00 40 52 2B AA 7D 84 E0 E0 22 11 C1 05 02 52 78 44 61 74 61 52", OtherFrame(0x91),
     ),
-    "S2C, remote answer to SL": (
+    "900HP p. 73, node identification with DD and level": (
+        "7E 00 25 95 00 13 A2 00 40 74 02 AC FF FE C2 FF FE 00 13 A2 00 40 74 02 AC 20 00 FF FE 01 01 C1 05 10 1E "
+        "00 0C 00 00 2E 33", OtherFrame(0x95),
+    ),
+    "ZB p. 118, remote answer to SL": (
         "7E 00 13 97 55 00 13 A2 00 40 52 2B AA 7D 84 53 4C 00 40 52 2B AA F0",
         RemoteResponse(0x55, BEACON, b"SL", 0, bytes.fromhex("40522BAA")),
     ),
-    "S2C, route record with three relays": (
+    "SX p. 200, remote answer to NI": (
+        "7E 00 0F 97 27 00 13 A2 00 12 34 56 78 12 7E 4E 49 00 51", RemoteResponse(0x27, OTHER, b"NI", 0, b""),
+    ),
+    "SX p. 200, remote request that was not transmitted": (
+        "7E 00 0F 97 27 00 13 A2 00 12 34 56 78 FF FE 49 44 04 EA", RemoteResponse(0x27, OTHER, b"ID", 4, b""),
+    ),
+    "forums.digi.com 11628, remote DB that was not transmitted": (
+        "7E 00 0F 97 01 00 13 A2 00 70 40 76 44 FF FE 44 42 04 C1",
+        RemoteResponse(1, 0x0013A20070407644, b"DB", 4, b""),
+    ),
+    "ZB p. 119, S2C p. 203, route record with three relays": (
         "7E 00 13 A1 00 13 A2 00 40 40 11 22 33 44 01 03 EE FF CC DD AA BB 80", RouteRecord(0x0013A20040401122, 3),
     ),
-    "S2C, node identification": (
-        "7E 00 20 95 00 13 A2 00 40 52 2B AA 7D 84 02 7D 84 00 13 A2 00 40 52 2B AA 20 00 FF FE 01 01 C1 05 10 1E 1B",
-        OtherFrame(0x95),
+    "S2C p. 247, route record of four hops": (
+        "7E 00 13 A1 00 13 A2 00 12 34 56 78 DD DD 01 03 CC CC BB BB AA AA 75", RouteRecord(OTHER, 3),
     ),
-    "S2C 802.15.4, transmit status": ("7E 00 03 89 01 00 75", OtherFrame(0x89)),
-    "S2C, transmit of Hello": ("7E 00 0A 01 01 50 01 00 48 65 6C 6C 6F B8", OtherFrame(0x01)),
-    "XBee 3, command BD 1200": ("7E 00 06 08 01 42 44 04 B0 BC", OtherFrame(0x08)),
 }  # fmt: skip
 
 
@@ -65,9 +86,9 @@ def test_escapes_are_those_of_the_manual() -> None:
 
 def test_commands_are_those_of_the_manual() -> None:
     assert format_frame(format_at(0x52, b"MY"), is_escaped=False) == bytes.fromhex("7E 00 04 08 52 4D 59 FF")
-    # The manual's example sets BH of another module; its data and its option "apply changes" differ.
-    frame = format_remote_at(1, 0x0013A20040401122, b"BH")
-    assert frame == bytes.fromhex("17 01 00 13 A2 00 40 40 11 22 FF FE 00 42 48")
+    # As sent by the question at forums.digi.com, 11628.
+    frame = format_frame(format_remote_at(1, 0x0013A20070407644, b"DB"), is_escaped=False)
+    assert frame == bytes.fromhex("7E 00 0F 17 01 00 13 A2 00 70 40 76 44 FF FE 00 44 42 45")
 
 
 # Without escapes a frame whose last byte is 7E and gets lost borrows its end from the next frame: no level is 7E.
@@ -116,6 +137,8 @@ ZIGBEE = bytes.fromhex("1234 0013A20040522BAA") + b"beacon1\x00"
 @pytest.mark.parametrize(
     ("data", "node"),
     [
+        (bytes.fromhex("1785 0013A20040B45023 2000 FFFE 01 00 C105 101E"),  # as published, see above
+         Node(0x0013A20040B45023, "0013A20040B45023", False)),
         (ZIGBEE + bytes.fromhex("FFFE 01 00 C105 101E"), Node(BEACON, "beacon1", False)),
         (ZIGBEE + bytes.fromhex("0000 02 00 C105 101E"), Node(BEACON, "beacon1", False)),  # child of the coordinator
         (ZIGBEE + bytes.fromhex("4F21 02 00 C105 101E"), Node(BEACON, "beacon1", True)),  # child of a router
