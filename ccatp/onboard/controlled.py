@@ -19,10 +19,13 @@ class ControlledRobot(LinkedRobot):
     """The robot; its hardware has been started.
 
     Attributes:
+        loop_hz: rate of the control loop.
         faults: reason of each present fault, by its name on the link or that of a device.
         late_steps: steps of the control loop that came later than a barrier outside this program waits.
         dropped_samples: samples in no frame: a frame had too many, or they arrived after their frame.
     """
+
+    loop_hz: float
 
     def __init__(
         self,

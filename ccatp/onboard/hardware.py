@@ -4,7 +4,8 @@ One implementation drives the devices of Linux (``ccatp.onboard.devices``), othe
 robot's clock, s since the start of the program; wheel angles count up when the wheel drives the robot forwards.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from typing import NamedTuple, Protocol
 
 
@@ -44,6 +45,56 @@ class Readings(NamedTuple):
 
 class HardwareError(Exception):
     """A device is missing, fails, or is not the expected one; the text says which, why, and what to do."""
+
+
+class Device(Protocol):
+    """One device."""
+
+    @property
+    def identity(self) -> str:
+        """What it says of itself, or where it is."""
+
+    def open(self) -> None:
+        """Open it and wait until it works. Raises HardwareError."""
+
+    def close(self) -> None:
+        """Stop and release it."""
+
+
+def open_devices(devices: Mapping[str, Device], opened: ExitStack) -> None:
+    """Open one after the other; ``opened`` closes them. Raises HardwareError, with all closed again."""
+    try:
+        for device in devices.values():
+            opened.callback(device.close)
+            device.open()
+    except HardwareError:
+        opened.close()
+        raise
+
+
+def open_each(devices: Mapping[str, Device], opened: ExitStack) -> dict[str, str]:
+    """Open all that can be opened; the reason of each that cannot."""
+    failures: dict[str, str] = {}
+    for name, device in devices.items():
+        opened.callback(device.close)
+        try:
+            device.open()
+        except HardwareError as error:
+            failures[name] = str(error)
+    return failures
+
+
+LOW_SOC = 0.15  # below which a battery is reported as low
+
+
+def state_of_charge(battery_v: float, empty_v: float, full_v: float) -> float:
+    """State of charge, 0 to 1, linear in the voltage of the battery."""
+    return min(1.0, max(0.0, (battery_v - empty_v) / (full_v - empty_v)))
+
+
+def wrapped_change(now: int, before: int) -> int:
+    """Change of a counter of 32 bits, which wraps."""
+    return ((now - before + 0x80000000) & 0xFFFFFFFF) - 0x80000000
 
 
 class Hardware(Protocol):

@@ -5,8 +5,7 @@ from collections.abc import Callable
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.missions import Part
 from ccatp.onboard.devices.linux import LinuxHardware
-from ccatp.onboard.kinds import Controlled, RobotKind
-from ccatp.onboard.robot import OnboardRobot
+from ccatp.onboard.kinds import RobotKind
 
 
 def linux_hardware(cfg: OnboardConfig, clock: Callable[[], float]) -> LinuxHardware:
@@ -14,13 +13,8 @@ def linux_hardware(cfg: OnboardConfig, clock: Callable[[], float]) -> LinuxHardw
     return LinuxHardware(cfg.devices, clock)
 
 
-def onboard_robot(cfg: OnboardConfig, hardware: LinuxHardware) -> Controlled:
-    """The robot on started hardware."""
-    return Controlled(OnboardRobot(cfg, hardware), cfg.servo.loop_hz)
-
-
 MIRROR = RobotKind(
     load=Part("ccatp.config.load:load_onboard_config"),
     make_hardware=Part(f"{__name__}:linux_hardware"),
-    make_robot=Part(f"{__name__}:onboard_robot"),
+    make_robot=Part("ccatp.onboard.robot:OnboardRobot"),
 )

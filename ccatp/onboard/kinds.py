@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from ccatp.config.load import ConfigSource, Overrides, nested, read_source, strongest
 from ccatp.config.messages import choice_hint, format_value
@@ -37,13 +37,6 @@ class RobotHardware(Protocol):
         """Hold the wheels and release the devices."""
 
 
-class Controlled(NamedTuple):
-    """A robot on started hardware, and the rate of its control loop."""
-
-    robot: ControlledRobot
-    loop_hz: float
-
-
 class OnboardRobotConfig(Protocol):
     """What the configurations of all kinds have."""
 
@@ -61,7 +54,7 @@ class RobotKind:
 
     load: Part  # Callable[[Path | None, Overrides], C]
     make_hardware: Part  # Callable[[C, Callable[[], float]], RobotHardware]; the robot's clock
-    make_robot: Part  # Callable[[C, RobotHardware], Controlled]
+    make_robot: Part  # Callable[[C, RobotHardware], ControlledRobot]
     no_tuning: str = ""
 
     def hardware(self, cfg: OnboardRobotConfig, clock: Callable[[], float]) -> RobotHardware:
@@ -69,9 +62,9 @@ class RobotKind:
         made: RobotHardware = self.make_hardware.get()(cfg, clock)
         return made
 
-    def robot(self, cfg: OnboardRobotConfig, hardware: RobotHardware) -> Controlled:
+    def robot(self, cfg: OnboardRobotConfig, hardware: RobotHardware) -> ControlledRobot:
         """The robot on started hardware."""
-        made: Controlled = self.make_robot.get()(cfg, hardware)
+        made: ControlledRobot = self.make_robot.get()(cfg, hardware)
         return made
 
 

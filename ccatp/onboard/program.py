@@ -20,7 +20,7 @@ import structlog
 from ccatp.links import realtime
 from ccatp.links.service_manager import take_from
 from ccatp.onboard.controlled import ControlledRobot
-from ccatp.onboard.kinds import Controlled, RobotHardware
+from ccatp.onboard.kinds import RobotHardware
 from ccatp.onboard.server import TcpRobotServer
 
 PRIORITY = 40  # of SCHED_FIFO, where permitted: below the kernel's own interrupt threads (50)
@@ -102,14 +102,13 @@ class OnboardServer(TcpRobotServer):
     def __init__(
         self,
         robot: ControlledRobot,
-        loop_hz: float,
         boot_s: float,
         *,
         key: bytes | None = None,
         log: structlog.typing.FilteringBoundLogger,
     ) -> None:
         super().__init__(robot, lockstep=False, key=key, log=log)
-        self._step_s, self._device_log = 1.0 / loop_hz, log
+        self._step_s, self._device_log = 1.0 / robot.loop_hz, log
         self._periodic: PeriodicTimer | None = None
         self._started_s, self._clock_s = boot_s, 0.0
         self.lateness = Lateness()
@@ -166,7 +165,6 @@ class OnboardServer(TcpRobotServer):
 
 async def serve(
     robot: ControlledRobot,
-    loop_hz: float,
     listener: socket.socket,
     stop: asyncio.Event,
     key: bytes | None,
@@ -176,7 +174,7 @@ async def serve(
 ) -> None:
     """Run the robot on started hardware until ``stop`` is set; call ``each_step`` after each step of the loop."""
     notifier, watchdog_s = take_from(os.environ)
-    server = OnboardServer(robot, loop_hz, boot_s, key=key, log=log)
+    server = OnboardServer(robot, boot_s, key=key, log=log)
     server.each_step += each_step
     if watchdog_s is not None:
         period_s, sent_s = _WATCHDOG_SHARE * watchdog_s, [0.0]
@@ -211,7 +209,7 @@ async def serve(
 
 def run(
     make_hardware: Callable[[Callable[[], float]], RobotHardware],
-    make_robot: Callable[[RobotHardware], Controlled],
+    make_robot: Callable[[RobotHardware], ControlledRobot],
     listener: socket.socket,
     key: bytes | None,
     log: structlog.typing.FilteringBoundLogger,
@@ -229,8 +227,7 @@ def run(
         stop = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             loop.add_signal_handler(number, stop.set)
-        controlled = make_robot(hardware)
-        loop.run_until_complete(serve(controlled.robot, controlled.loop_hz, listener, stop, key, log, boot_s))
+        loop.run_until_complete(serve(make_robot(hardware), listener, stop, key, log, boot_s))
     finally:
         hardware.close()
         loop.close()

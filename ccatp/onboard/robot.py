@@ -72,6 +72,7 @@ class OnboardRobot(ControlledRobot):
         limits = link.ttl_s, robot.max_wheel_rad_s, robot.fan_floor
         super().__init__(limits, link.frame_hz, link.sample_latency_s, commands_delay_frames)
         self._cfg, self._hardware = cfg, hardware
+        self.loop_hz = cfg.servo.loop_hz
         self._servos = WheelServo(cfg.servo), WheelServo(cfg.servo)
         self._edges = [EdgeThreshold(cfg.edges) for _ in range(4)]
         self._rad_per_count = 2.0 * pi / cfg.servo.counts_per_rev
@@ -105,7 +106,7 @@ class OnboardRobot(ControlledRobot):
         """Read the devices and set the motor voltages and fans, at ``now_s`` of the robot's clock."""
         last_s, self._control_s = self._control_s, now_s
         self._take_readings(now_s)
-        dt_s = 1.0 / self._cfg.servo.loop_hz if last_s is None else now_s - last_s
+        dt_s = 1.0 / self.loop_hz if last_s is None else now_s - last_s
         right_set, left_set = self.rules.set_points(now_s)
         is_late = dt_s > self._cfg.devices.timer.timeout_s
         self.late_steps += is_late

@@ -1,9 +1,11 @@
-"""A whole mission of the daemon's processes through the drivers of the indoor robot, and its program as a server."""
+"""The on-board program of the indoor robot in a process of its own: conformance, ends, and whole missions."""
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import hypot, sqrt
@@ -14,6 +16,8 @@ import pytest
 
 from ccatp.beacons.analysis import open_beacons
 from ccatp.commissioning.conformance.runner import Conformance
+from tests.faults.linking import Measured
+from tests.support.beacon_processes import Devices, Driver, Onboard
 from tests.support.beacon_rig import PIONEER
 from tests.support.runs import NO_REPORT
 
@@ -27,9 +31,79 @@ LACKING = {
 }  # fmt: skip
 
 
+ONLY_BASE = {"devices__radio__is_used": False, "devices__dish__is_used": False}
+# Real encoders have no noise of their own; the base is faster than its mission lets it be.
+EXACT = {
+    "sim__vehicle__speed_sigma_m_s": 0.0,
+    "sim__vehicle__turn_rate_sigma_rad_s": 0.0,
+    "vehicle__turn_rate_max_rad_s": 5.0,
+    "vehicle__speed_max_m_s": 0.5,
+}
+
+
+@pytest.mark.parametrize("only", [FEW, pytest.param((), marks=pytest.mark.slow)], ids=["few", "all"])
+def test_the_program_conforms(tmp_path: Path, only: tuple[str, ...]) -> None:
+    robot = ONLY_BASE | {"link__frame_hz": 20.0}
+    with Devices(tmp_path, "zigbee", EXACT, robot) as devices, Onboard(devices.config) as onboard:
+        onboard.wait_for_hello()
+        results = Conformance(("127.0.0.1", onboard.port), None, 5.0).run(motion=True, only=only)
+    outcomes = {result.check_id: (result.outcome, result.detail) for result in results}
+    assert {name for name, (outcome, _) in outcomes.items() if outcome == "not applicable"} <= LACKING
+    assert not {name: seen for name, seen in outcomes.items() if seen[0] in ("fail", "undecided")}
+
+
+# -- ends of the program ----------------------------------------------------------------------------------------------
+
+
+def end(onboard: Onboard, number: signal.Signals) -> float:
+    """Send a signal to the program; the time."""
+    onboard.process.send_signal(number)
+    return time.monotonic()
+
+
+@pytest.mark.fault("B19")
+def test_the_base_stops_by_itself_after_the_program_was_killed(tmp_path: Path, measured: Measured) -> None:
+    with Devices(tmp_path, "zigbee", EXACT, ONLY_BASE) as devices, Onboard(devices.config) as onboard:
+        with Driver(onboard, 1.0):
+            devices.time_of("moves", 0.0, 60.0)
+            time.sleep(0.5)
+            killed_s = end(onboard, signal.SIGKILL)
+            measured("B19", 1e3 * (devices.time_of("stands", killed_s, 5.0) - killed_s), "ms")
+        # A program that is started again takes the base over, whose session is still open.
+        with Onboard(devices.config) as again, Driver(again, 1.0):
+            devices.time_of("moves", killed_s + 0.7, 60.0)
+
+
+@pytest.mark.fault("B20")
+def test_the_base_stops_while_the_program_is_stopped_and_goes_on_with_it(tmp_path: Path, measured: Measured) -> None:
+    with (
+        Devices(tmp_path, "zigbee", EXACT, ONLY_BASE) as devices,
+        Onboard(devices.config) as onboard,
+        Driver(onboard, 1.0),
+    ):
+        devices.time_of("moves", 0.0, 60.0)
+        time.sleep(0.5)
+        stopped_s = end(onboard, signal.SIGSTOP)
+        measured("B20", 1e3 * (devices.time_of("stands", stopped_s, 5.0) - stopped_s), "ms")
+        resumed_s = end(onboard, signal.SIGCONT)
+        devices.time_of("moves", resumed_s, 5.0)
+
+
+def test_the_wheels_stop_at_once_when_the_program_ends(tmp_path: Path) -> None:
+    with Devices(tmp_path, "zigbee", EXACT, ONLY_BASE) as devices, Onboard(devices.config) as onboard:
+        with Driver(onboard, 1.0):
+            devices.time_of("moves", 0.0, 60.0)
+            ended_s = end(onboard, signal.SIGTERM)
+            assert devices.time_of("stands", ended_s, 5.0) - ended_s < 0.45  # before the watchdog of the base
+        assert onboard.process.wait(10.0) == 0
+
+
+# -- missions ---------------------------------------------------------------------------------------------------------
+
+
 @contextmanager
 def program(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """The program in a process of its own, and its port."""
+    """The program's robot in lockstep in a process of its own, and its port."""
     command = [sys.executable, "-m", "tests.support.beacon_program", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -37,15 +111,6 @@ def program(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
             yield process, int(process.stdout.readline())
         finally:
             process.terminate()
-
-
-@pytest.mark.parametrize("only", [FEW, pytest.param((), marks=pytest.mark.slow)], ids=["few", "all"])
-def test_the_program_conforms(only: tuple[str, ...]) -> None:
-    with program("zigbee", "--realtime", "--frame-hz", "20") as (_, port):
-        results = Conformance(("127.0.0.1", port), None, 5.0).run(motion=True, only=only)
-    outcomes = {result.check_id: (result.outcome, result.detail) for result in results}
-    assert {name for name, (outcome, _) in outcomes.items() if outcome == "not applicable"} <= LACKING
-    assert not {name: seen for name, seen in outcomes.items() if seen[0] in ("fail", "undecided")}
 
 
 def toml_of(overrides: dict[str, Any], port: int) -> str:

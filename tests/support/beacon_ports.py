@@ -16,6 +16,7 @@ import socket
 import sys
 import time
 import tty
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -69,15 +70,10 @@ class Terminal:
     def exchange(self) -> None:
         """Bytes to the device, and its own."""
         for fd in self.fds:
-            try:
+            with suppress(BlockingIOError):  # nothing there
                 self._device.write(os.read(fd, _CHUNK))
-            except BlockingIOError:
-                pass
-            data = self._device.read(_CHUNK)
-            try:
-                os.write(fd, data)
-            except BlockingIOError:
-                pass  # nobody reads
+            with suppress(BlockingIOError):  # nobody reads
+                os.write(fd, self._device.read(_CHUNK))
 
 
 class Lines:
@@ -130,12 +126,12 @@ class FakeDevices:
         """Serve."""
         while not self._is_over:
             waiting = [fd for one in self._terminals.values() for fd in one.fds]
-            ready, _, _ = select.select([*waiting, *self._lines.fds, sys.stdin], [], [], _WAIT_S)
-            if sys.stdin in ready:
+            ready, _, _ = select.select([*waiting, *self._lines.fds, 0], [], [], _WAIT_S)
+            if 0 in ready:
                 self._change(sys.stdin.readline().split(maxsplit=3))
             for one in self._terminals.values():
                 one.exchange()
-            self._lines.answer(set(ready) - {sys.stdin})
+            self._lines.answer(set(ready))
             self._watch()
 
     def _change(self, words: list[str]) -> None:

@@ -162,7 +162,7 @@ class FakeDaq:
         self._arrived = b""
         self.boot()
 
-    def open(self, _device: str, _baud: int) -> "FakeDaq":
+    def open(self, _device: str, _baud: int, _key: str) -> "FakeDaq":
         if self.open_error is not None:
             raise self.open_error
         self.opened += 1

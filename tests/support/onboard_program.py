@@ -219,9 +219,7 @@ def main() -> int:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
         truth = GroundTruthPublisher(Truth(simulated.world, boot_s), options.truth)
         answering = asyncio.create_task(truth.serve())
-        await serve(
-            OnboardRobot(onboard, hardware), onboard.servo.loop_hz, listener, stop, None, log, boot_s, tell_held()
-        )
+        await serve(OnboardRobot(onboard, hardware), listener, stop, None, log, boot_s, tell_held())
         answering.cancel()
         truth.close()
         if simulated.world.is_fallen:

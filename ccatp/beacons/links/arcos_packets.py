@@ -5,16 +5,17 @@ a check sum (two bytes, high byte first). Names, numbers and layouts are those o
 """
 
 import struct
-from collections import Counter
 from typing import NamedTuple
+
+from ccatp.links.byte_frames import FrameFinder
 
 HEADER = b"\xfa\xfb"
 LONGEST = 208  # bytes after the count; a larger count is noise
 _POSITIVE, _NEGATIVE = 0x3B, 0x1B  # types of a number in a command
 
-# Commands. PULSE has the number of SYNC0, OPEN that of SYNC1.
+# Commands. OPEN has the number of SYNC1.
 SYNC0, SYNC1, SYNC2 = 0, 1, 2
-PULSE, OPEN, CLOSE, ENABLE, SETA, VEL, CONFIG, ENCODER, RVEL, SETRA, SONAR = 0, 1, 2, 4, 5, 11, 18, 19, 21, 23, 28
+OPEN, CLOSE, ENABLE, SETA, VEL, CONFIG, ENCODER, RVEL, SETRA, SONAR = 1, 2, 4, 5, 11, 18, 19, 21, 23, 28
 CONFIG_PACKET, ENCODER_PACKET = 0x20, 0x90
 STANDARD_PACKETS = frozenset((0x32, 0x33))  # motors stopped, robot moving
 _STANDARD = struct.Struct("<HHhhhBBBhHBB")
@@ -39,14 +40,6 @@ class Standard(NamedTuple):
     sonars: tuple[tuple[int, int], ...]
 
 
-class BaseConfig(NamedTuple):
-    """What the base says of itself: type, model, its watchdog, ticks of an encoder for a millimetre of travel."""
-
-    kind: str
-    model: str
-    watchdog_ms: int
-
-
 def check_sum(data: bytes) -> int:
     """Sum of the byte pairs, high byte first; a single last byte is XORed."""
     pairs = len(data) // 2 * 2
@@ -67,45 +60,22 @@ def format_command(command: int, value: int | None = None) -> bytes:
     return format_packet(bytes([command, kind]) + abs(value).to_bytes(2, "little"))
 
 
-class PacketReader:
-    """Finds the packets in bytes that arrive in pieces of any size; it stores less than one packet.
+class PacketReader(FrameFinder):
+    """Finds the packets in received bytes."""
 
-    Attributes:
-        counts: ``packets``, ``bad_sums``, ``noise`` (bytes).
-    """
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self.counts: Counter[str] = Counter()
+    START = HEADER
 
     def feed(self, data: bytes) -> list[bytes]:
         """Type and data of each packet that is complete now."""
-        buffer, packets = self._buffer, list[bytes]()
-        buffer += data
-        while (start := buffer.find(HEADER)) >= 0:
-            self._drop(start)
-            if len(buffer) < 3:
-                return packets
-            size = buffer[2]
-            if not 3 <= size <= LONGEST:
-                self._drop(1)
-                continue
-            if len(buffer) < 3 + size:
-                return packets
-            body = bytes(buffer[3 : 1 + size])
-            if check_sum(body) != int.from_bytes(buffer[1 + size : 3 + size]):
-                self.counts["bad_sums"] += 1
-                self._drop(1)
-                continue
-            packets.append(body)
-            self.counts["packets"] += 1
-            del buffer[: 3 + size]
-        self._drop(len(buffer) - buffer.endswith(HEADER[:1]))
-        return packets
+        return [packet[3:-2] for packet in self.find(data)]
 
-    def _drop(self, count: int) -> None:
-        self.counts["noise"] += count
-        del self._buffer[:count]
+    def _size(self, data: bytearray) -> int:
+        if len(data) < 3:
+            return 0
+        return 3 + data[2] if 3 <= data[2] <= LONGEST else -1
+
+    def _is_right(self, frame: bytes) -> bool:
+        return check_sum(frame[3:-2]) == int.from_bytes(frame[-2:])
 
 
 def parse_standard(packet: bytes) -> Standard | None:
@@ -140,15 +110,12 @@ def parse_names(packet: bytes) -> tuple[str, str, str]:
 _BEFORE_NAME, _BEFORE_WATCHDOG = 1 + 5 * 2, 3 + 2 + 2 + 1 + 2 + 2
 
 
-def parse_config(packet: bytes) -> BaseConfig | None:
-    """The packet that answers ``CONFIG``; None if it is none or too short."""
+def parse_watchdog_s(packet: bytes) -> float | None:
+    """The watchdog in the packet that answers ``CONFIG``; None if it is none or too short."""
     if packet[0] != CONFIG_PACKET:
         return None
-    kind, _, rest = packet[1:].partition(b"\0")
-    model, _, rest = rest.partition(b"\0")
-    _, _, rest = rest.partition(b"\0")
-    _, zero, rest = rest[_BEFORE_NAME:].partition(b"\0")
-    if not zero or len(rest) < _BEFORE_WATCHDOG + 2:
+    parts = packet[1:].split(b"\0", 3)  # type, model, serial number, and what follows them
+    _, zero, rest = parts[-1][_BEFORE_NAME:].partition(b"\0")
+    if len(parts) < 4 or not zero or len(rest) < _BEFORE_WATCHDOG + 2:
         return None
-    watchdog_ms = int.from_bytes(rest[_BEFORE_WATCHDOG : _BEFORE_WATCHDOG + 2], "little")
-    return BaseConfig(kind.decode("ascii", "replace"), model.decode("ascii", "replace"), watchdog_ms)
+    return 1e-3 * int.from_bytes(rest[_BEFORE_WATCHDOG : _BEFORE_WATCHDOG + 2], "little")

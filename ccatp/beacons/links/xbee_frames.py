@@ -5,8 +5,9 @@ A frame is 7E, the length of its data (two bytes, high byte first), the data, an
 The numbers of the frame types and the layouts are those of Digi's manuals of the S1, S2C and XBee 3 modules.
 """
 
-from collections import Counter
 from typing import NamedTuple
+
+from ccatp.links.byte_frames import FrameFinder
 
 START, ESCAPE, FLIP = 0x7E, 0x7D, 0x20
 ESCAPED = frozenset((START, ESCAPE, 0x11, 0x13))
@@ -71,72 +72,58 @@ class Node(NamedTuple):
     is_relayed: bool
 
 
-class FrameReader:
-    """Finds the frames in bytes that arrive in pieces of any size; it stores less than one frame.
+class FrameReader(FrameFinder):
+    """Finds the frames in received bytes; in mode 2 a frame may hold the start byte only escaped."""
 
-    Attributes:
-        counts: ``frames``, ``bad_sums``, ``noise`` (bytes).
-    """
+    START = bytes([START])
 
     def __init__(self, *, is_escaped: bool) -> None:
+        super().__init__()
         self._is_escaped = is_escaped
-        self._buffer = bytearray()
         self._flips_next = False
-        self.counts: Counter[str] = Counter()
 
     def feed(self, data: bytes) -> list[bytes]:
         """The data of each frame that is complete now."""
-        frames: list[bytes] = []
-        for byte in data:
-            if self._is_escaped and byte == START:
-                self._drop(len(self._buffer))
+        frames = list[bytes]()
+        if not self._is_escaped:
+            frames += self.find(data)
+        else:
+            first, *others = data.split(self.START)
+            frames += self.find(self._plain(first))
+            for part in others:
+                self.drop(len(self._buffer))
                 self._flips_next = False
-            elif self._is_escaped and byte == ESCAPE:
-                self._flips_next = True
-                continue
-            elif self._flips_next:
-                byte ^= FLIP  # noqa: PLW2901 - the byte that was sent
-                self._flips_next = False
-            self._buffer.append(byte)
-            frames += self._complete()
-        return frames
+                frames += self.find(self.START + self._plain(part))
+        return [frame[3:-1] for frame in frames]
 
     def give_up(self) -> list[bytes]:
         """A frame that is not complete now will not be: its length was damaged. Search its bytes for others."""
         if self._buffer:
-            self._drop_frame()
-        return self._complete()
+            self.drop_start()
+        return self.feed(b"")
 
-    def _complete(self) -> list[bytes]:
-        buffer, frames = self._buffer, list[bytes]()
-        while buffer:
-            if buffer[0] != START:
-                self._drop(1)
-                continue
-            if len(buffer) < 3:
-                break
-            size = buffer[1] << 8 | buffer[2]
-            if not 0 < size <= LONGEST:
-                self._drop_frame()
-                continue
-            if len(buffer) < size + 4:
-                break
-            if sum(buffer[3 : size + 4]) & 0xFF != 0xFF:
-                self.counts["bad_sums"] += 1
-                self._drop_frame()
-                continue
-            frames.append(bytes(buffer[3 : size + 3]))
-            self.counts["frames"] += 1
-            del buffer[: size + 4]
-        return frames
+    def drop_start(self) -> None:
+        """No frame begins here: with escapes none begins within it."""
+        self.drop(len(self._buffer) if self._is_escaped else 1)
 
-    def _drop_frame(self) -> None:
-        """Without escapes the next frame may begin within this one."""
-        self._drop(len(self._buffer) if self._is_escaped else 1)
+    def _plain(self, data: bytes) -> bytes:
+        plain = bytearray()
+        for byte in data:
+            if byte == ESCAPE:
+                self._flips_next = True
+                continue
+            plain.append(byte ^ FLIP if self._flips_next else byte)
+            self._flips_next = False
+        return bytes(plain)
 
-    def _drop(self, count: int) -> None:
-        self.counts["noise"] += count
-        del self._buffer[:count]
+    def _size(self, data: bytearray) -> int:
+        if len(data) < 3:
+            return 0
+        size = data[1] << 8 | data[2]
+        return size + 4 if 0 < size <= LONGEST else -1
+
+    def _is_right(self, frame: bytes) -> bool:
+        return sum(frame[3:]) & 0xFF == 0xFF
 
 
 def format_frame(data: bytes, *, is_escaped: bool) -> bytes:

@@ -4,29 +4,13 @@ Position 0 is straight ahead, where the end switch closes; positions grow to the
 dish turns back after each scan.
 """
 
-from collections.abc import Callable
-from typing import Protocol
-
 from ccatp.beacons.config.onboard_models import DishConfig
-from ccatp.onboard.devices.outputs import OpenLines, OutputLines
+from ccatp.onboard.devices.outputs import InputLine, OpenInput, OpenLines, OutputLines
 from ccatp.onboard.hardware import HardwareError
 
 _SEARCHED = 1.1  # turns in which the switch must close
 _LEAVES = 0.1  # turns in which it must open
 _BEYOND = 0.25  # turns: the dish turns back by as much beyond straight ahead, then the cable is tight
-
-
-class InputLine(Protocol):
-    """An input line of a GPIO chip."""
-
-    def get(self) -> bool:
-        """Its level. Raises HardwareError."""
-
-    def close(self) -> None:
-        """Release it."""
-
-
-OpenInput = Callable[[str, int], InputLine]  # chip and line
 
 
 class Dish:

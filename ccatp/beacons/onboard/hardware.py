@@ -12,26 +12,20 @@ from typing import NamedTuple
 
 from ccatp.beacons.config.onboard_models import BeaconOnboardConfig
 from ccatp.beacons.links.messages import MoteBurst
-from ccatp.beacons.onboard.dish import Dish, OpenInput
+from ccatp.beacons.onboard.dish import Dish
 from ccatp.beacons.onboard.listener import CricketListener
 from ccatp.beacons.onboard.pioneer import PioneerBase, WheelSpeeds
 from ccatp.beacons.onboard.scanner import Scanner
 from ccatp.beacons.onboard.xbee import Coordinator
 from ccatp.onboard.devices.linux import GpioInput, GpioLines, open_serial
-from ccatp.onboard.devices.outputs import OpenLines
-from ccatp.onboard.devices.serial_line import SerialPort
-from ccatp.onboard.hardware import DeviceCheck, HardwareError
+from ccatp.onboard.devices.outputs import OpenInput, OpenLines
+from ccatp.onboard.devices.serial_line import OpenPort
+from ccatp.onboard.hardware import LOW_SOC, Device, DeviceCheck, open_devices, open_each
 
-PATIENCE_S = 8.0  # for the answer of a device, beside the discovery of radios
-LOW_SOC = 0.15
 WRITE_S = 0.05  # for the transmission of a few bytes on a slow line, also when this computer is busy
-REOPEN_S = 2.0  # between two attempts to open the lines of the dish
 _LINES_KEY = "the lines in devices.dish"
-Sleep = Callable[[float], object]
-
-
-def _open_port(device: str, baud: int, key: str) -> SerialPort:
-    return open_serial(device, baud, key, WRITE_S)
+_OPEN_PORT = partial(open_serial, write_s=WRITE_S)
+_FAULTS_OF = {"base": ("encoder_right", "edge", "battery_low")}  # other devices have one, with their own name
 
 
 def _open_lines(chip: str, values: Mapping[int, bool]) -> GpioLines:
@@ -46,10 +40,10 @@ def _open_input(chip: str, line: int) -> GpioInput:
 class BeaconAccess:
     """How the devices are reached, and what waits for them; tests replace it."""
 
-    open_port: Callable[[str, int, str], SerialPort] = _open_port
+    open_port: OpenPort = _OPEN_PORT
     open_lines: OpenLines = _open_lines
     open_input: OpenInput = _open_input
-    sleep: Sleep = time.sleep
+    sleep: Callable[[float], object] = time.sleep
 
 
 class BeaconReadings(NamedTuple):
@@ -78,71 +72,39 @@ class BeaconHardware:
         self, config: BeaconOnboardConfig, clock: Callable[[], float], access: BeaconAccess | None = None
     ) -> None:
         access = access or BeaconAccess()
-        devices, body = config.devices, config.robot
-        self._config, self._clock, self._access = devices, clock, access
-
-        def port(key: str) -> Callable[[str, int], SerialPort]:
-            return lambda device, baud: access.open_port(device, baud, key)
-
-        self.base = self.radio = self.dish = self.scanner = None
+        devices = config.devices
+        self._clock, self._sleep = clock, access.sleep
+        # By their names in checks, in the order of opening.
+        self._devices: dict[str, Device] = {}
+        self.base = self.radio = self.scanner = None
         if devices.base.is_used:
-            self.base = PioneerBase(devices.base, (body.wheel_radius_m, body.track_m), port("devices.base"))
+            self.base = PioneerBase(devices.base, config.robot, access.open_port, clock, self._wait)
+            self._devices["base"] = self.base
         if devices.radio.is_used:
-            self.radio = Coordinator(devices.radio, port("devices.radio"))
-            if devices.dish.is_used:
-                self.dish = Dish(devices.dish, access.open_lines, access.open_input)
-            self.scanner = Scanner(devices.dish, self.radio, self.dish)
+            self.radio = Coordinator(devices.radio, access.open_port, clock, self._wait)
+            dish = Dish(devices.dish, access.open_lines, access.open_input) if devices.dish.is_used else None
+            self.scanner = Scanner(devices.dish, self.radio, dish, clock, self._wait)
+            self._devices["radio"] = self.radio
+            if dish is not None:
+                self._devices["dish"] = self.scanner
         names = devices.listeners.devices if devices.listeners.is_used else ()
-        self.listeners = [CricketListener(name, devices.listeners, port("devices.listeners")) for name in names]
+        self.listeners = [
+            CricketListener(name, devices.listeners, access.open_port, clock, self._wait) for name in names
+        ]
+        self._devices |= {one.title: one for one in self.listeners}
         self._opened = ExitStack()
-        self._reopen_s = 0.0
-
-    def _opening(self) -> dict[str, tuple[Callable[[], None], Callable[[], None]]]:
-        """How each device is opened and closed, by its name, in order."""
-        clock, sleep = self._clock, self._wait
-        found: dict[str, tuple[Callable[[], None], Callable[[], None]]] = {}
-        if self.base is not None:
-            found["base"] = partial(self.base.open, clock, sleep, PATIENCE_S), self.base.close
-        if self.radio is not None:
-            patience_s = PATIENCE_S + self._config.radio.discovery_s
-            found["radio"] = partial(self.radio.open, clock, sleep, patience_s), self.radio.close
-        if self.dish is not None:
-            found["dish"] = self._open_dish, self.dish.close
-        for one in self.listeners:
-            found[one.title] = partial(one.open, clock, sleep, PATIENCE_S), one.close
-        return found
-
-    def _open_dish(self) -> None:
-        """Open the lines and turn straight ahead. Raises HardwareError."""
-        if self.dish is None or self.scanner is None:
-            return
-        self.dish.open()
-        self.scanner.begin_homing()
-        while not self.dish.is_homed:
-            self.scanner.poll(self._clock())
-            if self.scanner.fault:
-                raise HardwareError(self.scanner.fault)
-            self._wait(self._config.dish.step_s)
 
     def _wait(self, duration_s: float) -> None:
-        self._access.sleep(duration_s)
-        self._keep()
-
-    def _keep(self) -> None:
-        """The base holds its wheels while other devices are opened."""
+        """The base holds its wheels while other devices are opened and closed."""
+        self._sleep(duration_s)
         if self.base is not None and self.base.is_ready:
             self.base.poll(self._clock())
             self.base.drive(0.0, 0.0, self._clock())
 
     def start(self) -> None:
         """Open every device. Raises HardwareError."""
-        try:
-            for opens, closes in self._opening().values():
-                self._opened.callback(closes)
-                opens()
-        except HardwareError:
-            self.close()
-            raise
+        open_devices(self._devices, self._opened)
+        self.read(self._clock())  # nobody asked for what came in the meantime
 
     def read(self, now_s: float) -> BeaconReadings:
         """What was measured since the last call; ``now_s`` is the time of this call."""
@@ -161,7 +123,6 @@ class BeaconHardware:
                 faults["battery_low"] = f"battery at {100.0 * soc:.0f} %; charge it"
         if self.radio is not None and self.scanner is not None:
             self.radio.poll(now_s)
-            self._keep_dish_open(now_s)
             self.scanner.poll(now_s)
             if not self.radio.is_ready:
                 faults["radio"] = self.radio.why()
@@ -177,18 +138,6 @@ class BeaconHardware:
                 faults[one.title] = reason
         return BeaconReadings(wheels, distances_m, motes, soc, stall, faults)
 
-    def _keep_dish_open(self, now_s: float) -> None:
-        """After a fault the lines are opened again, and the dish is homed."""
-        if self.dish is None or self.scanner is None or not self.scanner.fault or now_s < self._reopen_s:
-            return
-        self._reopen_s = now_s + REOPEN_S
-        self.dish.close()
-        try:
-            self.dish.open()
-            self.scanner.begin_homing()
-        except HardwareError as error:
-            self.scanner.fault = str(error)
-
     def drive(self, right_rad_s: float, left_rad_s: float, now_s: float) -> None:
         """Set the speeds of the wheels. Raises HardwareError."""
         if self.base is not None:
@@ -200,37 +149,23 @@ class BeaconHardware:
 
     def check(self, duration_s: float) -> list[DeviceCheck]:
         """Open each device, read for ``duration_s`` while the robot stands still, close."""
-        failures: dict[str, str] = {}
         with self._opened:
-            for name, (opens, closes) in self._opening().items():
-                self._opened.callback(closes)
-                try:
-                    opens()
-                except HardwareError as error:
-                    failures[name] = str(error)
-            end_s, counted = self._clock() + duration_s, 0
-            faults: dict[str, str] = {}
+            failures = open_each(self._devices, self._opened)
+            readings, counted = self.read(self._clock()), 0
+            end_s = self._clock() + duration_s
             while (now_s := self._clock()) < end_s:
                 readings = self.read(now_s)
-                faults, counted = readings.faults, counted + len(readings.wheels)
-                self._keep()
-                self._access.sleep(0.005)
-        names = {"base": ("encoder_right", "edge", "battery_low"), "radio": ("radio",), "dish": ("dish",)}
+                counted += len(readings.wheels)
+                self._wait(0.005)
         checks = []
-        for name in self._opening():
-            present = [faults[fault] for fault in names.get(name, (name,)) if fault in faults]
-            problems = [failures[name]] if name in failures else present
-            found, advice = name not in failures, problems[0] if problems else ""
+        for name, device in self._devices.items():
+            faults = [readings.faults[fault] for fault in _FAULTS_OF.get(name, (name,)) if fault in readings.faults]
+            problems = [failures[name]] if name in failures else faults
             rate_hz = counted / duration_s if name == "base" else 0.0
-            checks.append(DeviceCheck(name, found, self._identity(name), rate_hz, "", not problems, advice))
+            advice = problems[0] if problems else ""
+            checks.append(
+                DeviceCheck(
+                    name, name not in failures, device.identity, rate_hz, "", passed=not problems, advice=advice
+                )
+            )
         return checks
-
-    def _identity(self, name: str) -> str:
-        if name == "base" and self.base is not None:
-            watchdog = "" if self.base.watchdog_s is None else f", watchdog {self.base.watchdog_s:g} s"
-            return f"{self.base.identity}{watchdog}"
-        if name == "radio" and self.radio is not None:
-            return f"{self.radio.identity}; hears {', '.join(sorted(self.radio.radios)) or 'nobody'}"
-        if name == "dish" and self.dish is not None:
-            return self.dish.identity
-        return next((one.identity for one in self.listeners if one.title == name), "")

@@ -5,7 +5,8 @@ from math import inf
 from ccatp.beacons.config.onboard_models import ListenersConfig
 from ccatp.beacons.links.cricket_lines import LineReader
 from ccatp.beacons.links.messages import MoteBurst
-from ccatp.beacons.onboard.serial_device import SerialDevice
+from ccatp.beacons.onboard.recognition import BeaconDevice
+from ccatp.onboard.devices.serial_device import Clock, Sleep
 from ccatp.onboard.devices.serial_line import OpenPort
 from ccatp.onboard.hardware import HardwareError
 
@@ -15,7 +16,7 @@ _REPORT_COMMAND = b"\rG CF\r"
 _DIGITS = 6
 
 
-class CricketListener(SerialDevice):
+class CricketListener(BeaconDevice):
     """The mote.
 
     Attributes:
@@ -23,11 +24,12 @@ class CricketListener(SerialDevice):
         reader: of the received bytes.
     """
 
-    def __init__(self, name: str, config: ListenersConfig, open_port: OpenPort) -> None:
-        super().__init__(config.devices[name], config.baud, open_port)
+    key = "devices.listeners"
+
+    def __init__(self, name: str, config: ListenersConfig, open_port: OpenPort, clock: Clock, sleep: Sleep) -> None:
+        super().__init__((config.devices[name], config.baud), open_port, clock, sleep)
         self._config = config
-        self.name = name
-        self.title, self.key = f"listener {name}", "devices.listeners"
+        self.name, self.title = name, f"listener {name}"
         self.reader = LineReader()
         self._bursts: list[MoteBurst] = []
         self._ask_s = self._report_s = 0.0
@@ -36,7 +38,7 @@ class CricketListener(SerialDevice):
     @property
     def is_ready(self) -> bool:
         """It has sent a line."""
-        return self._line.is_open and (bool(self.identity) or self.reader.counts["pulses"] > 0)
+        return self._line.is_open and (bool(self._identity) or self.reader.counts["pulses"] > 0)
 
     def take(self) -> list[MoteBurst]:
         """The pulses since the last call, oldest first."""
@@ -50,18 +52,24 @@ class CricketListener(SerialDevice):
         return f"{self.title}: {self.why()}"
 
     def _begin(self, now_s: float) -> None:
+        super()._begin(now_s)
         self.reader = LineReader()
-        self.identity = ""
+        self._identity = ""
         self._ask(now_s)
 
-    def _read(self, data: bytes, now_s: float) -> None:
+    def _ask(self, now_s: float) -> None:
+        self._ask_s, self._report_s = now_s + ASK_S, now_s + REPORT_S
+        self._line.write(_REPORT_COMMAND)
+
+    def _receive(self, data: bytes, now_s: float) -> None:
+        super()._receive(data, now_s)
         reader = self.reader
         before = reader.counts["silent"] + reader.counts["reports"]
         pulses, report = reader.feed(data), reader.report
         if report.mode is not None and report.mode != "Listener":
             raise HardwareError(f"the mote is in {report.mode.lower()} mode; set it to listener mode (MD)")
         if report.unique_id is not None:
-            self.identity = f"Cricket {report.unique_id} {report.space or ''}".strip()
+            self._identity = f"Cricket {report.unique_id} {report.space or ''}".strip()
         if pulses or reader.counts["silent"] + reader.counts["reports"] > before:
             self._heard_s = now_s
             self._line.accept(now_s)
@@ -70,16 +78,8 @@ class CricketListener(SerialDevice):
         temperature_c = report.temperature_c if report.temperature_c is not None else self._config.temperature_c
         t_s = round(now_s, _DIGITS)
         self._bursts += [MoteBurst(t_s, one.sender, self.name, temperature_c, [one.delay_s]) for one in pulses]
-
-    def _stop(self) -> None:
-        self._ask_s = self._report_s = 0.0
-
-    def _ask(self, now_s: float) -> None:
-        self._ask_s, self._report_s = now_s + ASK_S, now_s + REPORT_S
-        self._line.write(_REPORT_COMMAND)
-
-    def _receive(self, data: bytes, now_s: float) -> None:
-        if data:
-            self._read(data, now_s)
         if now_s >= min(self._ask_s, self._report_s):
             self._ask(now_s)
+
+    def _stop(self) -> None:
+        pass  # a mote goes on by itself

@@ -8,7 +8,7 @@ the next command.
 
 from math import inf, pi
 
-from ccatp.beacons.config.onboard_models import BaseDeviceConfig
+from ccatp.beacons.config.onboard_models import BaseDeviceConfig, BeaconBodyConfig
 from ccatp.beacons.links.arcos_packets import (
     CLOSE,
     CONFIG,
@@ -26,14 +26,15 @@ from ccatp.beacons.links.arcos_packets import (
     PacketReader,
     Standard,
     format_command,
-    parse_config,
     parse_encoders,
     parse_names,
     parse_standard,
+    parse_watchdog_s,
 )
-from ccatp.beacons.onboard.serial_device import SerialDevice
+from ccatp.beacons.onboard.recognition import BeaconDevice
+from ccatp.onboard.devices.serial_device import Clock, Sleep
 from ccatp.onboard.devices.serial_line import OpenPort
-from ccatp.onboard.hardware import HardwareError
+from ccatp.onboard.hardware import HardwareError, state_of_charge, wrapped_change
 
 ASK_S = 0.25  # between two packets of the handshake
 CLOSED_S = 1.0  # that the base needs after the end of a session
@@ -48,11 +49,10 @@ _CONTINUOUS = 2
 WheelSpeeds = tuple[float, float | None, float | None]  # time; mean speed of the right and left wheel since the last
 
 
-class PioneerBase(SerialDevice):
+class PioneerBase(BeaconDevice):
     """The base.
 
     Attributes:
-        watchdog_s: its own; None before it was read.
         stall: reason while a wheel is stalled or a bumper pressed; empty otherwise.
         soc: state of charge, 0 to 1.
         reader: of the received bytes.
@@ -60,10 +60,12 @@ class PioneerBase(SerialDevice):
 
     title, key = "base", "devices.base"
 
-    def __init__(self, config: BaseDeviceConfig, body: tuple[float, float], open_port: OpenPort) -> None:
-        super().__init__(config.device, config.baud, open_port)
+    def __init__(
+        self, config: BaseDeviceConfig, body: BeaconBodyConfig, open_port: OpenPort, clock: Clock, sleep: Sleep
+    ) -> None:
+        super().__init__((config.device, config.baud), open_port, clock, sleep)
         self._config = config
-        self._radius_m, self._track_m = body
+        self._radius_m, self._track_m = body.wheel_radius_m, body.track_m
         self.reader = PacketReader()
         self._stage = SYNC0
         self._ask_s = self._enable_s = self._standard_s = self._counts_s = -inf
@@ -74,7 +76,6 @@ class PioneerBase(SerialDevice):
         self._set_points, self._sent_s = (0.0, 0.0), -inf
         self._ranges: dict[int, tuple[float, float]] = {}  # time, m
         self._doubts = 0
-        self.watchdog_s: float | None = None
         self.stall = ""
         self.soc = 1.0
 
@@ -86,6 +87,7 @@ class PioneerBase(SerialDevice):
     # -- in time ------------------------------------------------------------------------------------------------------
 
     def _begin(self, now_s: float) -> None:
+        super()._begin(now_s)
         self.reader = PacketReader()
         self._restart(now_s)
 
@@ -93,14 +95,14 @@ class PioneerBase(SerialDevice):
         self._stage, self._ask_s, self._last = SYNC0, now_s, None
         self._standard_s = self._counts_s = -inf
         self._ranges = {}
-        self.watchdog_s = None
 
     def _stop(self) -> None:
         stage, self._stage = self._stage, SYNC0
-        if self._line.is_open and stage == _RUNS:
+        if stage == _RUNS:
             self._line.write(format_command(VEL, 0) + format_command(RVEL, 0) + format_command(CLOSE))
 
     def _receive(self, data: bytes, now_s: float) -> None:
+        super()._receive(data, now_s)
         for packet in self.reader.feed(data):
             self._line.accept(now_s)
             self._take_packet(packet, now_s)
@@ -119,17 +121,17 @@ class PioneerBase(SerialDevice):
             elif kind == self._stage:
                 if kind == SYNC2:
                     name, base, model = parse_names(packet)
-                    self.identity = f"{base} {model} {name}".strip()
+                    self._identity = f"{base} {model} {name}".strip()
                     self._line.write(format_command(OPEN))
                 self._stage += 1
                 self._ask_s = now_s
-        elif self._stage == _CONFIGURES and (found := parse_config(packet)) is not None:
-            self.watchdog_s = 1e-3 * found.watchdog_ms
-            if not 0.0 < self.watchdog_s <= config.most_watchdog_s:
+        elif self._stage == _CONFIGURES and (watchdog_s := parse_watchdog_s(packet)) is not None:
+            if not 0.0 < watchdog_s <= config.most_watchdog_s:
                 raise HardwareError(
-                    f"{self.identity}: its watchdog is {self.watchdog_s:g} s; set WatchDog of the base to at most "
+                    f"{self._identity}: its watchdog is {watchdog_s:g} s; set WatchDog of the base to at most "
                     f"{1e3 * config.most_watchdog_s:.0f} ms"
                 )
+            self._identity += f", watchdog {watchdog_s:g} s"
             acceleration = round(1e3 * config.acceleration_m_s2)
             turn = round(config.turn_acceleration_rad_s2 / _DEGREE_RAD)
             for command, value in (
@@ -148,8 +150,7 @@ class PioneerBase(SerialDevice):
         self._standard_s = now_s
         for number, range_mm in standard.sonars:
             self._ranges[number] = now_s, 1e-3 * range_mm
-        span_v = config.battery_full_v - config.battery_empty_v
-        self.soc = min(1.0, max(0.0, (standard.battery_v - config.battery_empty_v) / span_v))
+        self.soc = state_of_charge(standard.battery_v, config.battery_empty_v, config.battery_full_v)
         stalled = [side for side, is_stalled in zip(("left", "right"), standard.stalls, strict=True) if is_stalled]
         pressed = [side for side, bits in zip(("front", "rear"), standard.bumpers, strict=True) if bits]
         self.stall = f"{stalled[0]} wheel stalled" if stalled else f"{pressed[0]} bumper pressed" if pressed else ""
@@ -172,9 +173,7 @@ class PioneerBase(SerialDevice):
         if last is None or now_s - last_s > self._config.timeout_s or now_s <= last_s:
             return  # a gap: the speeds within it are not known
         per_rad = 1e3 * self._radius_m * self._config.counts_per_mm
-        left, right = (
-            ((now - before + 0x80000000) & 0xFFFFFFFF) - 0x80000000 for now, before in zip(counts, last, strict=True)
-        )
+        left, right = (wrapped_change(now, before) for now, before in zip(counts, last, strict=True))
         self._rates = right / per_rad / (now_s - last_s), left / per_rad / (now_s - last_s)
         self._samples.append((now_s, *self._rates))
 

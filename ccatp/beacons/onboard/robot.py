@@ -40,6 +40,7 @@ class BeaconOnboardRobot(ControlledRobot):
         link, body = cfg.link, cfg.robot
         super().__init__((link.ttl_s, body.max_wheel_rad_s, 0.0), link.frame_hz, link.sample_latency_s)
         self._cfg, self._hardware = cfg, hardware
+        self.loop_hz = body.loop_hz
         self._control_s: float | None = None
         self._driven_s = 0.0  # since the newest scan
         self._stands, self._stands_since_s = hardware.base is None, 0.0  # the wheels, since when
@@ -84,7 +85,7 @@ class BeaconOnboardRobot(ControlledRobot):
     def control(self, now_s: float) -> None:
         """Read the devices and set the speeds of the wheels, at ``now_s`` of the robot's clock."""
         last_s, self._control_s = self._control_s, now_s
-        dt_s = 1.0 / self._cfg.robot.loop_hz if last_s is None else now_s - last_s
+        dt_s = 1.0 / self.loop_hz if last_s is None else now_s - last_s
         readings = self._hardware.read(now_s)
         self.faults = dict(readings.faults)
         self._soc = readings.soc

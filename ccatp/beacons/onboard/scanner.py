@@ -13,8 +13,10 @@ from ccatp.beacons.config.onboard_models import DishConfig
 from ccatp.beacons.links.messages import RadioSample, RadioScan
 from ccatp.beacons.onboard.dish import Dish
 from ccatp.beacons.onboard.xbee import Coordinator
+from ccatp.onboard.devices.serial_device import Clock, Sleep
 from ccatp.onboard.hardware import HardwareError
 
+REOPEN_S = 2.0  # between two attempts to open the lines of the dish
 _DIGITS = 6
 
 
@@ -45,13 +47,17 @@ class Scanner:
         counts: ``scans``, ``interrupted``.
     """
 
-    def __init__(self, config: DishConfig, coordinator: Coordinator, dish: Dish | None) -> None:
+    def __init__(
+        self, config: DishConfig, coordinator: Coordinator, dish: Dish | None, clock: Clock, sleep: Sleep
+    ) -> None:
         self._config, self._coordinator, self._dish = config, coordinator, dish
+        self._clock, self._sleep = clock, sleep
         self._phase = Phase.READY if dish is None else Phase.HOMING
         self._levels: dict[str, list[float | None]] = {}
         self._left: list[str] = []  # radios that are not asked yet at this position
         self._at = self._resets = 0
-        self._step_s = self._settled_s = 0.0
+        self._directions = 1 if dish is None else config.positions
+        self._step_s = self._settled_s = self._reopen_s = 0.0
         self._result: ScanResult | None = None
         self.fault = self.interrupted = ""
         self.counts: Counter[str] = Counter(scans=0, interrupted=0)
@@ -67,10 +73,31 @@ class Scanner:
         """Whether the robot must stand."""
         return self._phase in {Phase.TURNING, Phase.SETTLING, Phase.ASKING, Phase.RETURNING}
 
+    # -- the dish as a device -----------------------------------------------------------------------------------------
+
     @property
-    def directions(self) -> int:
-        """Number of directions of a scan."""
-        return 1 if self._dish is None else self._config.positions
+    def identity(self) -> str:
+        """Of the dish."""
+        return "" if self._dish is None else self._dish.identity
+
+    def open(self) -> None:
+        """Open the lines of the dish and turn it straight ahead. Raises HardwareError."""
+        if self._dish is None:
+            return
+        self._dish.open()
+        self._begin_homing()
+        while not self._dish.is_homed:
+            self.poll(self._clock())
+            if self.fault:
+                raise HardwareError(self.fault)
+            self._sleep(self._config.step_s)
+
+    def close(self) -> None:
+        """Release the lines of the dish."""
+        if self._dish is not None:
+            self._dish.close()
+
+    # -- scans --------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
         """Begin a scan of the radios that are known now."""
@@ -91,12 +118,21 @@ class Scanner:
         result, self._result = self._result, None
         return result
 
-    def begin_homing(self) -> None:
+    def _begin_homing(self) -> None:
         """The lines of the dish were opened, or its position is not known any more."""
         if self._dish is not None:
             self.interrupt("the dish has lost its position")
             self._dish.begin_homing()
             self._phase, self.fault = Phase.HOMING, ""
+
+    def _reopen(self, now_s: float) -> None:
+        """After a fault the lines are opened again, and the dish is homed. Raises HardwareError."""
+        if self._dish is None or not self.fault or now_s < self._reopen_s:
+            return
+        self._reopen_s = now_s + REOPEN_S
+        self._dish.close()
+        self._dish.open()
+        self._begin_homing()
 
     def poll(self, now_s: float) -> None:
         """Go on."""
@@ -106,6 +142,7 @@ class Scanner:
             elif not self._coordinator.is_ready:
                 self.interrupt(f"radio: {self._coordinator.why()}")
         try:
+            self._reopen(now_s)
             self._go_on(now_s)
         except HardwareError as error:
             self.interrupt(str(error))
@@ -139,7 +176,7 @@ class Scanner:
         elif self._phase is Phase.RETURNING and dish.turn_back():
             if abs(dish.lost_steps) > config.tolerance_steps:
                 self.interrupt(f"the dish has lost {abs(dish.lost_steps)} steps")
-                self.begin_homing()
+                self._begin_homing()
                 return
             self._phase = Phase.READY
             if self._levels:
@@ -153,7 +190,7 @@ class Scanner:
                 self.interrupt(f"radio: {error}")
             return
         self._at += 1
-        if self._at < self.directions:
+        if self._at < self._directions:
             self._phase = Phase.TURNING
         elif self._dish is not None:
             self._phase = Phase.RETURNING
@@ -170,4 +207,4 @@ class Scanner:
             samples = [RadioSample(t_s, name, z, None) for name, (z,) in heard.items() if z is not None]
             self._result = ScanResult(None, samples)
         elif heard:
-            self._result = ScanResult(RadioScan(t_s, tau / self.directions, heard), [])
+            self._result = ScanResult(RadioScan(t_s, tau / self._directions, heard), [])

@@ -25,7 +25,8 @@ from ccatp.beacons.links.xbee_frames import (
     parse_frame,
     parse_node,
 )
-from ccatp.beacons.onboard.serial_device import SerialDevice
+from ccatp.beacons.onboard.recognition import PATIENCE_S, BeaconDevice
+from ccatp.onboard.devices.serial_device import Clock, Sleep
 from ccatp.onboard.devices.serial_line import OpenPort
 from ccatp.onboard.hardware import HardwareError
 
@@ -51,7 +52,7 @@ class _Request(NamedTuple):
     has_answered: bool  # the radio; then the module is asked
 
 
-class Coordinator(SerialDevice):
+class Coordinator(BeaconDevice):
     """The module.
 
     Attributes:
@@ -64,9 +65,10 @@ class Coordinator(SerialDevice):
 
     title, key = "radio", "devices.radio"
 
-    def __init__(self, config: RadioDeviceConfig, open_port: OpenPort) -> None:
-        super().__init__(config.device, config.baud, open_port)
+    def __init__(self, config: RadioDeviceConfig, open_port: OpenPort, clock: Clock, sleep: Sleep) -> None:
+        super().__init__((config.device, config.baud), open_port, clock, sleep)
         self._config = config
+        self.patience_s = PATIENCE_S + config.discovery_s
         self._is_escaped = config.api_mode == 2
         self.reader = FrameReader(is_escaped=self._is_escaped)
         self._frame_id = 0
@@ -86,6 +88,11 @@ class Coordinator(SerialDevice):
     def is_ready(self) -> bool:
         """It has answered, and the radios were searched."""
         return self._line.is_open and self._is_found
+
+    @property
+    def identity(self) -> str:
+        """What it says of itself, and whom it hears."""
+        return f"{self._identity}; hears {', '.join(sorted(self.radios)) or 'nobody'}"
 
     @property
     def missing(self) -> list[str]:
@@ -111,6 +118,7 @@ class Coordinator(SerialDevice):
     # -- in time ------------------------------------------------------------------------------------------------------
 
     def _begin(self, now_s: float) -> None:
+        super()._begin(now_s)
         self.reader = FrameReader(is_escaped=self._is_escaped)
         self._restart(now_s)
 
@@ -129,6 +137,7 @@ class Coordinator(SerialDevice):
             self._result = Strength(request.name, None)
 
     def _receive(self, data: bytes, now_s: float) -> None:
+        super()._receive(data, now_s)
         self._now_s = now_s
         frames = self.reader.feed(data)
         if self._request is not None and now_s > self._request.until_s and not frames:
@@ -204,7 +213,7 @@ class Coordinator(SerialDevice):
             if len(self._answers) == len(_QUESTIONS):
                 high, low, version = (self._answers[command].hex().upper() for command in (b"SH", b"SL", b"VR"))
                 name = self._answers[b"NI"].decode("ascii", "replace").strip()
-                self.identity = f"XBee {high}{low} {name}, firmware {version}"
+                self._identity = f"XBee {high}{low} {name}, firmware {version}"
 
     # -- requests -----------------------------------------------------------------------------------------------------
 

@@ -32,15 +32,14 @@ every identity as a restart of the device: it sends a start, and its own unwrapp
 
 import binascii
 import struct
-from collections import Counter
-from collections.abc import Callable
-from contextlib import suppress
 from math import inf
 from typing import NamedTuple
 
 from ccatp.config.onboard_models import DaqConfig
-from ccatp.onboard.devices.serial_line import OpenPort, SerialLine
-from ccatp.onboard.hardware import HardwareError
+from ccatp.links.byte_frames import FrameFinder
+from ccatp.onboard.devices.serial_device import Clock, SerialDevice, Sleep
+from ccatp.onboard.devices.serial_line import OpenPort
+from ccatp.onboard.hardware import HardwareError, state_of_charge, wrapped_change
 
 SYNC, VERSION = b"\xa5\x5a", 1
 IDENTIFY, START, STOP, IDENTITY, SAMPLES = 0x01, 0x02, 0x03, 0x81, 0x82
@@ -48,16 +47,11 @@ HEADER, CRC, SAMPLE = struct.Struct("<2sBBBH"), struct.Struct("<H"), struct.Stru
 FULL_SCALE = 65535.0
 
 ASK_S = 0.25  # between two requests for the identity
-SEND_S = 0.02  # time for the transmission of a frame
 ANSWER_S = 5.0  # opening the port may reset the device, whose start may take some seconds
 BATTERY_S = 1.0  # time constant of the battery's voltage, over which the motors' currents average out
 
 # Of DeviceClock. SLEW: twice the largest error of a clock, 1 %, so that a remaining offset decreases.
 SETTLE_S, WINDOW_S, SLEW, JUMP_S = 0.1, 0.2, 0.02, 0.1
-
-
-Clock = Callable[[], float]
-Sleep = Callable[[float], object]
 
 
 class DaqSample(NamedTuple):
@@ -75,54 +69,41 @@ def format_frame(kind: int, seq: int, payload: bytes = b"", version: int = VERSI
     return frame + CRC.pack(binascii.crc_hqx(frame[2:], 0xFFFF))
 
 
-class Decoder:
-    """Finds the frames in bytes that arrive in pieces of any size; it stores less than one frame.
+class Decoder(FrameFinder):
+    """Finds the frames in received bytes.
 
     Attributes:
-        counts: ``frames``, ``lost`` (by gaps of the sequence numbers), ``crc_errors``, ``noise`` (bytes), ``unknown``.
+        counts: besides those of every protocol ``lost`` (by gaps of the sequence numbers), ``unknown``.
         other_version: protocol version of the newest valid frame if it is not ``VERSION``, otherwise 0.
     """
 
+    START = SYNC
+
     def __init__(self) -> None:
-        self._buffer = bytearray()
+        super().__init__()
         self._next_seq: int | None = None
-        self.counts: Counter[str] = Counter()
         self.other_version = 0
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
         """Type and payload of each frame that is complete now."""
-        buffer = self._buffer
-        frames: list[tuple[int, bytes]] = []
-        buffer += data
-        while (start := buffer.find(SYNC)) >= 0:
-            self._drop_noise(start)
-            if len(buffer) < HEADER.size:
-                return frames
-            _, version, kind, size, seq = HEADER.unpack_from(buffer)
-            end = HEADER.size + size
-            if len(buffer) < end + CRC.size:
-                return frames
-            if binascii.crc_hqx(buffer[2:end], 0xFFFF) != CRC.unpack_from(buffer, end)[0]:
-                self.counts["crc_errors"] += 1
-                self._drop_noise(1)  # the next frame may begin within this one
+        found: list[tuple[int, bytes]] = []
+        for frame in self.find(data):
+            _, version, kind, _, seq = HEADER.unpack_from(frame)
+            self.other_version = 0 if version == VERSION else version
+            if self.other_version:
                 continue
-            payload = bytes(buffer[HEADER.size : end])
-            del buffer[: end + CRC.size]
-            if version != VERSION:
-                self.other_version = version
-                continue
-            self.other_version = 0
-            self.counts["frames"] += 1
             gap = 0 if self._next_seq is None else (seq - self._next_seq) & 0xFFFF
             self.counts["lost"] += gap if gap < 0x8000 else 0
             self._next_seq = (seq + 1) & 0xFFFF
-            frames.append((kind, payload))
-        self._drop_noise(len(buffer) - buffer.endswith(SYNC[:1]))
-        return frames
+            found.append((kind, frame[HEADER.size : -CRC.size]))
+        return found
 
-    def _drop_noise(self, count: int) -> None:
-        self.counts["noise"] += count
-        del self._buffer[:count]
+    def _size(self, data: bytearray) -> int:
+        return HEADER.size + data[4] + CRC.size if len(data) >= HEADER.size else 0
+
+    def _is_right(self, frame: bytes) -> bool:
+        (crc,) = CRC.unpack_from(frame, len(frame) - CRC.size)
+        return bool(binascii.crc_hqx(frame[2 : -CRC.size], 0xFFFF) == crc)
 
 
 class DeviceClock:
@@ -175,120 +156,110 @@ class DeviceClock:
         return min(now_s, device_s + self._offset_s)
 
 
-class Daq:
-    """The device. ``poll`` never waits; after a disconnection it opens the port and starts the device again.
+class Daq(SerialDevice):
+    """The device.
 
     Attributes:
-        identity: name, version and serial number; empty until the device has answered.
         battery_v: voltage of the battery, smoothed; None before the first sample.
         decoder: of the received bytes.
     """
 
+    title, key = "data acquisition device", "devices.daq"
+    answer_s = patience_s = ANSWER_S
+
     def __init__(self, config: DaqConfig, open_port: OpenPort, clock: Clock, sleep: Sleep) -> None:
-        self._config, self._now, self._sleep = config, clock, sleep
+        super().__init__((config.device, config.baud), open_port, clock, sleep)
+        self._config = config
         self._volt = config.full_scale_v / FULL_SCALE
-        self._line = SerialLine(config.device, config.baud, open_port)
         self._ask_s = self._sample_s = -inf
         self._seq = 0
         self._is_started = False
-        self._clock = DeviceClock()
+        self._device_clock = DeviceClock()
         self._counts = [0, 0]
         self._last_counts: tuple[int, int] | None = None
-        self.identity = ""
+        self._samples: list[DaqSample] = []
         self.battery_v: float | None = None
         self.decoder = Decoder()
 
+    @property
+    def is_ready(self) -> bool:
+        """It sends samples."""
+        return bool(self._samples)
+
     def open(self) -> None:
         """Open the port and wait for samples. Raises HardwareError."""
-        until_s = self._now() + ANSWER_S
-        while not self.poll(self._now()):
-            if not self._line.is_open or self._now() > until_s:
-                reason = self._why()
-                self.close()
-                raise HardwareError(f"data acquisition device: {reason}")
-            self._sleep(0.005)
+        super().open()
+        self._samples.clear()  # nobody asked for those of the wait
 
-    def poll(self, now_s: float) -> list[DaqSample]:
+    def take(self) -> list[DaqSample]:
         """Samples since the last call."""
-        samples: list[DaqSample] = []
-        line = self._line
-        try:
-            if line.ensure_open(now_s):
-                self._ask_s, self._is_started = now_s, False
-            if not line.is_open:
-                return []
-            for kind, payload in self.decoder.feed(line.read()):
-                line.accept(now_s)
-                if kind == IDENTITY:
-                    self._begin(payload)
-                elif kind == SAMPLES and self._is_started and payload and len(payload) % SAMPLE.size == 0:
-                    samples += self._read_samples(payload, now_s)
-                else:
-                    self.decoder.counts["unknown"] += 1
-            self._supervise(now_s)
-        except (OSError, ValueError, HardwareError) as error:
-            line.lose(now_s, error)
+        samples, self._samples = self._samples, []
         return samples
 
     def fault(self, now_s: float) -> str:
         """The reason if the newest sample is older than ``timeout_s``, otherwise empty."""
         age_s = now_s - self._sample_s
-        return "" if age_s <= self._config.timeout_s else f"no sample for {age_s:.2f} s: {self._why()}"
+        return "" if age_s <= self._config.timeout_s else f"no sample for {age_s:.2f} s: {self.why()}"
 
     def soc(self) -> float:
-        """State of charge, 0 to 1, linear in the voltage of the battery; 1 before the first sample."""
-        empty_v, full_v = self._config.battery_empty_v, self._config.battery_full_v
-        battery_v = full_v if self.battery_v is None else self.battery_v
-        return min(1.0, max(0.0, (battery_v - empty_v) / (full_v - empty_v)))
+        """State of charge, 0 to 1; 1 before the first sample."""
+        if self.battery_v is None:
+            return 1.0
+        return state_of_charge(self.battery_v, self._config.battery_empty_v, self._config.battery_full_v)
 
-    def close(self) -> None:
-        """Stop the device and release the port."""
-        if self._line.is_open:
-            with suppress(OSError):
-                self._send(STOP)
-                self._sleep(SEND_S)
-            self._line.release()
+    def _begin(self, now_s: float) -> None:
+        self._ask_s, self._is_started = now_s, False
 
-    def _supervise(self, now_s: float) -> None:
-        """Ask a device without samples for its identity. Raises OSError if no valid frame came for ``ANSWER_S``."""
-        if now_s - self._line.valid_s > ANSWER_S:
-            raise OSError(self._why())
+    def _receive(self, data: bytes, now_s: float) -> None:
+        for kind, payload in self.decoder.feed(data):
+            self._line.accept(now_s)
+            if kind == IDENTITY:
+                self._start(payload)
+            elif kind == SAMPLES and self._is_started and payload and len(payload) % SAMPLE.size == 0:
+                self._samples += self._read_samples(payload, now_s)
+            else:
+                self.decoder.counts["unknown"] += 1
         is_silent = not self._is_started or now_s - self._sample_s > ASK_S
         if is_silent and now_s >= self._ask_s:
             self._send(IDENTIFY)
             self._ask_s = now_s + ASK_S
 
-    def _begin(self, payload: bytes) -> None:
+    def _stop(self) -> None:
+        self._send(STOP)
+
+    def _start(self, payload: bytes) -> None:
         """Handle an identity: start the device; its counts and its clock begin again."""
         fastest_hz = int.from_bytes(payload[:2], "little")
-        self.identity = " ".join(payload[2:].decode("utf-8", "replace").split("\0")).strip()
+        self._identity = " ".join(payload[2:].decode("utf-8", "replace").split("\0")).strip()
         if fastest_hz < self._config.sample_hz:
-            raise HardwareError(f"{self.identity} delivers {fastest_hz} samples/s at most; lower devices.daq.sample_hz")
-        self._clock, self._last_counts, self._is_started = DeviceClock(), None, True
+            raise HardwareError(
+                f"{self._identity} delivers {fastest_hz} samples/s at most; lower devices.daq.sample_hz"
+            )
+        self._device_clock, self._last_counts, self._is_started = DeviceClock(), None, True
         self._send(START, struct.pack("<H", round(self._config.sample_hz)))
 
     def _read_samples(self, payload: bytes, now_s: float) -> list[DaqSample]:
         timed = []
         for device_us, right, left, *edges, battery in SAMPLE.iter_unpack(payload):
-            device_s = self._clock.unwrap(device_us)
+            device_s = self._device_clock.unwrap(device_us)
             if device_s is None:  # it was reset, and its identity was lost
                 self._is_started = False
                 return []
             before = self._last_counts or (right, left)
             self._last_counts = right, left
             self._counts = [
-                total + ((now - last + 0x80000000) & 0xFFFFFFFF) - 0x80000000
+                total + wrapped_change(now, last)
                 for total, now, last in zip(self._counts, self._last_counts, before, strict=True)
             ]
             timed.append((device_s, self._counts, edges))
             battery_v = battery * self._volt * self._config.battery_ratio
             before_v = battery_v if self.battery_v is None else self.battery_v
             self.battery_v = before_v + (battery_v - before_v) / (BATTERY_S * self._config.sample_hz)
-        if not self._clock.arrive(now_s):
+        if not self._device_clock.arrive(now_s):
             return []
         samples = []
         for device_s, (right, left), edges in timed:
-            t_s = self._clock.time_s(device_s, now_s)
+            t_s = self._device_clock.time_s(device_s, now_s)
             if t_s > self._sample_s:
                 fl, fr, rl, rr = (self._volt * edge for edge in edges)
                 samples.append(DaqSample(t_s, right, left, (fl, fr, rl, rr)))
@@ -296,14 +267,13 @@ class Daq:
         self._line.recover()
         return samples
 
-    def _why(self) -> str:
+    def why(self) -> str:
         """The reason why there are no samples."""
-        if not self._line.is_open:
-            return self._line.reason
-        if version := self.decoder.other_version:
+        if self._line.is_open and (version := self.decoder.other_version):
             return f"speaks version {version} of the protocol instead of {VERSION}; install the firmware that fits"
-        if reason := self._line.garbage_reason("devices.daq"):
-            return reason
+        return super().why()
+
+    def _silence(self) -> str:
         if not self._is_started:
             return "it does not answer; check its firmware, devices.daq.device and devices.daq.baud"
         return "it sends no samples, or has just started"

@@ -19,11 +19,18 @@ from ccatp.onboard.devices.bno055 import Bno055, Bus
 from ccatp.onboard.devices.daq import Daq
 from ccatp.onboard.devices.outputs import PWM_ROOT, ExternalTimer, FanOutputs, Motors, OpenLines, explain
 from ccatp.onboard.devices.serial_line import OpenPort, SerialPort
-from ccatp.onboard.hardware import DeviceCheck, HardwareError, Readings
+from ccatp.onboard.hardware import (
+    LOW_SOC,
+    Device,
+    DeviceCheck,
+    HardwareError,
+    Readings,
+    open_devices,
+    open_each,
+)
 
 I2C_TIMEOUT = 0x0702  # ioctl of linux/i2c-dev.h, in 10 ms
 BUS_TIMEOUT_10MS = 5
-LOW_SOC = 0.15
 FAN_CHECK_S = 0.1
 RATE_TOLERANCE = 0.1
 _LINES_KEY = "the lines in devices.motors and devices.timer"
@@ -72,7 +79,7 @@ class I2cBus:
         self._bus.close()
 
 
-def open_serial(device: str, baud: int, key: str = "devices.daq", write_s: float = 0.002) -> SerialPort:
+def open_serial(device: str, baud: int, key: str, write_s: float = 0.002) -> SerialPort:
     """Open a serial port for exclusive use, with reads that do not wait. Raises HardwareError.
 
     ``key``: section of the configuration. ``write_s``: longest time of a write.
@@ -161,7 +168,7 @@ class LinuxHardware:
         self._daq = Daq(config.daq, access.open_port, clock, sleep)
         # Keys: sections of the configuration. Order of opening: the motors brake first; the devices that then send
         # samples, which are not read before all are open, come last.
-        self._devices: dict[str, Motors | ExternalTimer | FanOutputs | Bno055 | Daq] = {
+        self._devices: dict[str, Device] = {
             "motors": self._motors,
             "timer": self._timer,
             "fans": self._fans,
@@ -172,16 +179,11 @@ class LinuxHardware:
         self._fan_check_s = clock()
 
     def start(self) -> None:
-        try:
-            for device in self._devices.values():
-                self._opened.callback(device.close)
-                device.open()
-        except HardwareError:
-            self.close()
-            raise
+        open_devices(self._devices, self._opened)
 
     def read(self, now_s: float) -> Readings:
-        samples = self._daq.poll(now_s)
+        self._daq.poll(now_s)
+        samples = self._daq.take()
         inertial = self._imu.take(now_s)
         if now_s - self._fan_check_s >= FAN_CHECK_S:
             self._fan_check_s = now_s
@@ -221,15 +223,9 @@ class LinuxHardware:
 
     def check(self, duration_s: float) -> list[DeviceCheck]:
         """Open each device, read for ``duration_s`` while the robot stands still, close; the motors brake."""
-        failures: dict[str, str] = {}
         readings: list[Readings] = []
         with self._opened:
-            for name, device in self._devices.items():
-                self._opened.callback(device.close)
-                try:
-                    device.open()
-                except HardwareError as error:
-                    failures[name] = str(error)
+            failures = open_each(self._devices, self._opened)
             end_s = self._clock() + duration_s
             while (now_s := self._clock()) < end_s:
                 readings.append(self.read(now_s))

@@ -1,4 +1,4 @@
-"""Outputs of the robot's computer: PWM of the kernel, GPIO lines; motors, fans and external timer that use them."""
+"""PWM of the kernel and GPIO lines of the robot's computer; motors, fans and external timer that use them."""
 
 import errno
 import os
@@ -45,6 +45,17 @@ class OutputLines(Protocol):
         """Release them."""
 
 
+class InputLine(Protocol):
+    """An input line of a GPIO chip."""
+
+    def get(self) -> bool:
+        """Its level. Raises HardwareError."""
+
+    def close(self) -> None:
+        """Release it."""
+
+
+OpenInput = Callable[[str, int], InputLine]  # chip and line
 # Chip and the first values of its lines, which apply from the moment in which a line becomes an output.
 OpenLines = Callable[[str, Mapping[int, bool]], OutputLines]
 

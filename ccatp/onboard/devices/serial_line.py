@@ -28,7 +28,7 @@ class SerialPort(Protocol):
         """Release it."""
 
 
-OpenPort = Callable[[str, int], SerialPort]  # device file and baud rate
+OpenPort = Callable[[str, int, str], SerialPort]  # device file, baud rate, section of the configuration
 
 
 class SerialLine:
@@ -40,8 +40,8 @@ class SerialLine:
         garbage: bytes since then.
     """
 
-    def __init__(self, device: str, baud: int, open_port: OpenPort) -> None:
-        self._device, self._baud, self._open_port = device, baud, open_port
+    def __init__(self, device: str, baud: int, open_port: OpenPort, key: str) -> None:
+        self._device, self._baud, self._open_port, self._key = device, baud, open_port, key
         self._port: SerialPort | None = None
         self._retry_s, self._wait_s = -inf, RETRY_S
         self.reason = ""
@@ -60,7 +60,7 @@ class SerialLine:
         """
         if self._port is not None or now_s < self._retry_s:
             return False
-        self._port = self._open_port(self._device, self._baud)
+        self._port = self._open_port(self._device, self._baud, self._key)
         self.accept(now_s)
         return True
 
@@ -100,6 +100,6 @@ class SerialLine:
             with suppress(OSError):
                 port.close()
 
-    def garbage_reason(self, key: str) -> str:
-        """That the bytes make no sense; empty while they are few. ``key``: the section of the configuration."""
-        return f"garbage at {self._baud} baud; check {key}.baud" if self.garbage >= GARBAGE_BYTES else ""
+    def garbage_reason(self) -> str:
+        """That the bytes make no sense; empty while they are few."""
+        return f"garbage at {self._baud} baud; check {self._key}.baud" if self.garbage >= GARBAGE_BYTES else ""

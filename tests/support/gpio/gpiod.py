@@ -60,7 +60,7 @@ class Request:
         self._socket.close()
 
 
-def request_lines(chip: str, consumer: str, config: Mapping[int, LineSettings]) -> Request:  # noqa: ARG001
+def request_lines(chip: str, consumer: str, config: Mapping[int, LineSettings]) -> Request:
     """Lines of a chip."""
     request = Request(chip)
     outputs = {n: one.output_value for n, one in config.items() if one.direction is Direction.OUTPUT}

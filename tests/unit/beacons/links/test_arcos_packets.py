@@ -8,7 +8,6 @@ from ccatp.beacons.links.arcos_packets import (
     CLOSE,
     ENABLE,
     OPEN,
-    PULSE,
     RVEL,
     SETA,
     SONAR,
@@ -16,23 +15,22 @@ from ccatp.beacons.links.arcos_packets import (
     SYNC1,
     SYNC2,
     VEL,
-    BaseConfig,
     PacketReader,
     check_sum,
     format_command,
     format_packet,
-    parse_config,
     parse_encoders,
     parse_names,
     parse_standard,
+    parse_watchdog_s,
 )
 
-# Commands as bytes in the test test_packet.cpp of ros_arcos (University of Patras, 2015), in a public program for a P3-DX
-# with an HCS12 (StopUltra, SetAcc1, ResetPos), in the class Comms for PeopleBots, and in a question at answers.ros.org
+# Commands as bytes in test_packet.cpp of ros_arcos (University of Patras, 2015), in a public program for a P3-DX with
+# an HCS12 (StopUltra, SetAcc1, ResetPos), in the class Comms for PeopleBots, and in a question at answers.ros.org
 # (351531). The base answers SYNC0 to SYNC2 with the same packets.
 PUBLISHED = {
     "SYNC0": (format_command(SYNC0), "FA FB 03 00 00 00"),
-    "PULSE": (format_command(PULSE), "FA FB 03 00 00 00"),
+    "PULSE": (format_command(0), "FA FB 03 00 00 00"),
     "SYNC1": (format_command(SYNC1), "FA FB 03 01 00 01"),
     "OPEN": (format_command(OPEN), "FA FB 03 01 00 01"),
     "SYNC2": (format_command(SYNC2), "FA FB 03 02 00 02"),
@@ -89,8 +87,8 @@ def standard(**changes: object) -> bytes:
     return head + b"".join(struct.pack("<BH", *sonar) for sonar in sonars) + bytes(12)
 
 
-# Nobody has published the bytes of a standard, encoder or configuration packet that this project has found. Layouts as in
-# the tables of the Pioneer 3 manual, and as three independent programs read them: ARIA, p2os, ros_arcos.
+# No published bytes of a standard, encoder or configuration packet were found. The layouts are those of the tables in
+# the Pioneer 3 manual, and three independent programs read them so: ARIA, p2os, ros_arcos.
 def test_a_standard_packet() -> None:
     found = parse_standard(standard())
     assert found is not None
@@ -117,9 +115,9 @@ def test_encoders_names_and_configuration() -> None:
     assert parse_names(b"\x02") == ("", "", "")
     head = b"\x20Pioneer\x00p3dx-sh\x00SN1\x00\x04" + struct.pack("<5H", 1, 2, 3, 4, 500) + b"name\x00"
     body = bytes([0, 2, 0]) + struct.pack("<HHBHHH", 0, 1, 0, 115, 16570, 800)
-    assert parse_config(head + body) == BaseConfig("Pioneer", "p3dx-sh", 800)
-    assert parse_config(head + body[:-1]) is None
-    assert parse_config(b"\x20Pioneer") is None
+    assert parse_watchdog_s(head + body) == pytest.approx(0.8)
+    assert parse_watchdog_s(head + body[:-1]) is None
+    assert parse_watchdog_s(b"\x20Pioneer") is None
 
 
 def test_a_byte_lost_at_any_position_costs_at_most_the_packet_and_the_next() -> None:

@@ -137,8 +137,10 @@ ZIGBEE = bytes.fromhex("1234 0013A20040522BAA") + b"beacon1\x00"
 @pytest.mark.parametrize(
     ("data", "node"),
     [
-        (bytes.fromhex("1785 0013A20040B45023 2000 FFFE 01 00 C105 101E"),  # as published, see above
-         Node(0x0013A20040B45023, "0013A20040B45023", False)),
+        (
+            bytes.fromhex("1785 0013A20040B45023 2000 FFFE 01 00 C105 101E"),  # as published, see above
+            Node(0x0013A20040B45023, "0013A20040B45023", False),
+        ),
         (ZIGBEE + bytes.fromhex("FFFE 01 00 C105 101E"), Node(BEACON, "beacon1", False)),
         (ZIGBEE + bytes.fromhex("0000 02 00 C105 101E"), Node(BEACON, "beacon1", False)),  # child of the coordinator
         (ZIGBEE + bytes.fromhex("4F21 02 00 C105 101E"), Node(BEACON, "beacon1", True)),  # child of a router

@@ -21,10 +21,10 @@ class Rig:
         self.time = FakeTime()
         self.device = FakeMote(self.time, "1:c8:6a:b3:a:0:0:dc", temperature_c)
         self.port: FakePort = self.device
-        self.listener = CricketListener("robot", cfg, lambda *_: self.port.open())
+        self.listener = CricketListener("robot", cfg, lambda *_: self.port.open(), self.time, self.time.sleep)
 
     def open(self) -> "Rig":
-        self.listener.open(self.time, self.time.sleep, 8.0)
+        self.listener.open()
         return self
 
     def run(self, duration_s: float) -> None:

@@ -7,6 +7,7 @@ from math import inf, radians
 import pytest
 
 from ccatp.beacons.config.onboard_load import load_beacon_onboard_config
+from ccatp.beacons.config.onboard_models import BeaconOnboardConfig
 from ccatp.beacons.onboard.pioneer import PioneerBase
 from ccatp.onboard.hardware import HardwareError
 from tests.support.beacon_fakes import FakePioneer, FakePort, FakeXBee
@@ -20,20 +21,23 @@ class Rig:
 
     def __init__(self, **settings: object) -> None:
         overrides = {f"devices.base.{key}": value for key, value in settings.items()}
-        cfg = load_beacon_onboard_config(None, overrides).devices.base
+        cfg = load_beacon_onboard_config(None, overrides)
         self.time = FakeTime()
         self.ranges_m = [0.5 + 0.1 * k for k in range(16)]
         self.driven: list[tuple[float, float]] = []
         self.device = FakePioneer(self.time, self._move, lambda: self.ranges_m, TRACK_M)
-        self.base = PioneerBase(cfg, (RADIUS_M, TRACK_M), lambda *_: self.device.open())
+        self.base = self.driver(cfg)
         self.samples: list[tuple[float, float | None, float | None]] = []
+
+    def driver(self, cfg: BeaconOnboardConfig) -> PioneerBase:
+        return PioneerBase(cfg.devices.base, cfg.robot, lambda *_: self.device.open(), self.time, self.time.sleep)
 
     def _move(self, velocity_m_s: float, turn_rad_s: float) -> tuple[float, float]:
         self.driven.append((velocity_m_s, turn_rad_s))
         return velocity_m_s, turn_rad_s
 
     def open(self) -> "Rig":
-        self.base.open(self.time, self.time.sleep, 8.0)
+        self.base.open()
         return self
 
     def run(self, duration_s: float, right: float | None = None, left: float = 0.0) -> None:
@@ -52,8 +56,7 @@ def rig() -> Rig:
 
 
 def test_the_handshake_and_what_the_base_says_of_itself(rig: Rig) -> None:
-    assert rig.base.identity == "Pioneer p3dx-sh Bradley_1"
-    assert rig.base.watchdog_s == 0.5
+    assert rig.base.identity == "Pioneer p3dx-sh Bradley_1, watchdog 0.5 s"
     assert rig.base.soc == pytest.approx((12.5 - 11.0) / 1.7, abs=0.01)
     assert rig.device.is_enabled
     rig.run(0.2)
@@ -161,8 +164,7 @@ def test_the_motors_stay_off_after_the_stop_button(rig: Rig) -> None:
 def test_the_session_of_a_program_that_died_is_closed_first() -> None:
     rig = Rig().open()
     rig.run(0.5, 1.0, 1.0)
-    cfg = load_beacon_onboard_config().devices.base
-    rig.base = PioneerBase(cfg, (RADIUS_M, TRACK_M), lambda *_: rig.device.open())
+    rig.base = rig.driver(load_beacon_onboard_config())
     rig.open()
     assert rig.device.velocity == 0.0
     rig.run(0.3)

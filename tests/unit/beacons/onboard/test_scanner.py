@@ -29,14 +29,12 @@ class Rig:
         self.lost: set[str] = set()
         self.asked: list[tuple[str, int]] = []
         self.device = FakeXBee(self.time, NAMES, self._level)
-        self.radio = Coordinator(cfg.radio, lambda *_: self.device.open())
+        self.radio = Coordinator(cfg.radio, lambda *_: self.device.open(), self.time, self.time.sleep)
         self.dish = Dish(cfg.dish, self.fake.open_lines, self.fake.open_input) if has_dish else None
-        self.scanner = Scanner(cfg.dish, self.radio, self.dish)
-        self.radio.open(self.time, self.time.sleep, 16.0)
+        self.scanner = Scanner(cfg.dish, self.radio, self.dish, self.time, self.time.sleep)
+        self.radio.open()
         if self.dish is not None:
-            self.dish.open()
-            self.scanner.begin_homing()
-            self.run(2.0)
+            self.scanner.open()
 
     def _level(self, name: str) -> float | None:
         self.asked.append((name, self.fake.turned))
@@ -172,7 +170,9 @@ def test_after_lost_steps_the_dish_is_homed_and_the_next_scan_is_right() -> None
 def test_a_switch_that_does_not_change(switch: bool, message: str) -> None:
     rig = Rig()
     rig.fake.switch = switch
-    rig.scanner.begin_homing()
+    rig.scanner.close()
+    with pytest.raises(HardwareError, match=message):
+        rig.scanner.open()
     rig.run(2.0)
     assert rig.scanner.fault == message
     assert not rig.scanner.is_ready

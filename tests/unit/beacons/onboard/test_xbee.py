@@ -26,11 +26,10 @@ class Rig:
         self.levels: dict[str, float | None] = {"beacon1": -40.0, "beacon2": -62.0}
         self.device = FakeXBee(self.time, NAMES, self.levels.__getitem__)
         self.device.api_mode, self.device.is_zigbee = api_mode, is_zigbee
-        self.radio = Coordinator(cfg, lambda *_: self.device.open())
-        self.patience_s = 8.0 + cfg.discovery_s
+        self.radio = Coordinator(cfg, lambda *_: self.device.open(), self.time, self.time.sleep)
 
     def open(self) -> "Rig":
-        self.radio.open(self.time, self.time.sleep, self.patience_s)
+        self.radio.open()
         return self
 
     def run(self, duration_s: float) -> None:
@@ -57,7 +56,7 @@ class Rig:
 @pytest.mark.parametrize("is_zigbee", [True, False])
 def test_radios_are_found_and_their_strengths_are_their_own(api_mode: int, is_zigbee: bool) -> None:
     rig = Rig(api_mode=api_mode, is_zigbee=is_zigbee).open()
-    assert rig.radio.identity == "XBee 0013A20041AE0001 CRT, firmware 4060"
+    assert rig.radio.identity == "XBee 0013A20041AE0001 CRT, firmware 4060; hears beacon1, beacon2"
     assert rig.radio.wanted == NAMES
     assert not rig.radio.missing
     for level in (-40.0, -17.0, -19.0, -100.0):  # 11 and 13 in hexadecimal are escaped in mode 2

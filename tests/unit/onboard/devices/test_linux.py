@@ -233,7 +233,7 @@ def test_check_names_what_is_wrong(rig: Rig, broken: Break, device: str, is_foun
     ("package", "install", "open_device"),
     [
         ("smbus2", "smbus2", lambda: I2cBus(1)),
-        ("serial", "pyserial", lambda: open_serial("/dev/ttyACM0", 921600)),
+        ("serial", "pyserial", lambda: open_serial("/dev/ttyACM0", 921600, "devices.daq")),
         ("gpiod", "gpiod", lambda: GpioLines("/dev/gpiochip0", {5: True})),
     ],
 )
