@@ -12,12 +12,14 @@ from math import hypot, sqrt
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ccatp.beacons.analysis import open_beacons
 from ccatp.commissioning.conformance.runner import Conformance
+from ccatp.records.recorder import iter_logged
 from tests.faults.linking import Measured
-from tests.support.beacon_processes import Devices, Driver, Onboard
+from tests.support.beacon_processes import Devices, Driver, Onboard, options
 from tests.support.beacon_rig import PIONEER
 from tests.support.runs import NO_REPORT
 
@@ -96,6 +98,7 @@ def test_the_wheels_stop_at_once_when_the_program_ends(tmp_path: Path) -> None:
             ended_s = end(onboard, signal.SIGTERM)
             assert devices.time_of("stands", ended_s, 5.0) - ended_s < 0.45  # before the watchdog of the base
         assert onboard.process.wait(10.0) == 0
+        assert time.monotonic() - ended_s < 2.0
 
 
 # -- missions ---------------------------------------------------------------------------------------------------------
@@ -113,36 +116,56 @@ def program(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
             process.terminate()
 
 
-def toml_of(overrides: dict[str, Any], port: int) -> str:
-    lines = [f"{key.replace('__', '.')} = {json.dumps(value)}" for key, value in overrides.items()]
-    return "\n".join([*lines, f"robot.port = {port}", "dashboard.enabled = false"]) + "\n"
+RMS_M = {"zigbee": 0.152, "follow": 0.203, "cricket": 0.048}
+SLOWER = {"mission__follow_s": 450.0, "sim__target__speed_m_s": 0.0065, "follow__lost_after_s": 60.0}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("system", "changes"),
-    [
-        ("zigbee", {}),
-        ("follow", {"mission__follow_s": 450.0, "sim__target__speed_m_s": 0.0065, "follow__lost_after_s": 60.0}),
-        ("cricket", {}),
-    ],
-)
+@pytest.mark.parametrize(("system", "world"), [("zigbee", {}), ("follow", SLOWER), ("cricket", {})])
+def test_missions_of_the_installed_program_over_serial_lines(
+    tmp_path: Path, runtime_dir: Path, system: str, world: dict[str, Any]
+) -> None:
+    with Devices(tmp_path, system, world, {}) as devices, Onboard(devices.config) as onboard:
+        onboard.wait_for_hello()
+        summary = run_mission(tmp_path, runtime_dir, system, world, onboard.port)
+    ((utc_offset_ns, _), *_) = iter_logged(tmp_path / "run" / "telemetry.mcap")
+    assert utc_offset_ns is not None
+    track, truth = open_beacons(tmp_path / "run").track(), np.array(devices.truth)
+    times_s = track["t_s"] + 1e-9 * utc_offset_ns
+    is_known = (times_s > truth[0, 0]) & (times_s < truth[-1, 0])
+    is_known &= track["t_s"] >= (summary["map"].get("map_time_s") or 0.0)  # before, the robot stands at its start
+    x_m, y_m = (np.interp(times_s, truth[:, 0], truth[:, column]) for column in (1, 2))
+    errors_m = np.hypot(track["x_m"] - x_m, track["y_m"] - y_m)[is_known]
+    rms_m = float(np.sqrt(np.mean(errors_m**2)))
+    print(f"{system}: {rms_m:.4f} m over serial lines, at most {RMS_M[system]} m")
+    assert len(errors_m) > 0.5 * len(times_s)
+    assert rms_m < RMS_M[system]
+
+
+def run_mission(folder: Path, runtime_dir: Path, system: str, changes: dict[str, Any], port: int) -> dict[str, Any]:
+    """Run a mission of the daemon against the robot; its summary."""
+    lines = [f"{key.replace('__', '.')} = {json.dumps(value)}" for key, value in (PIONEER | changes).items()]
+    config = folder / "mission.toml"
+    config.write_text("\n".join([f'system = "{system}"', *lines, f"robot.port = {port}", "dashboard.enabled = false"]))
+    run = [sys.executable, "-m", "ccatp", "run", "--config", str(config), "--json"]
+    run += ["--run-dir", str(folder / "run"), "--runtime-dir", str(runtime_dir)]
+    done = subprocess.run(run, env=os.environ | NO_REPORT, capture_output=True, text=True, timeout=1200, check=False)
+    assert done.returncode == 0, done.stderr
+    summary: dict[str, Any] = json.loads(done.stdout)
+    assert summary["outcome"] == "complete"
+    return summary
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("system", "changes"), [("zigbee", {}), ("follow", SLOWER), ("cricket", {})])
 def test_missions_of_the_processes_through_the_drivers(
     tmp_path: Path, runtime_dir: Path, system: str, changes: dict[str, Any]
 ) -> None:
-    settings = [f"--set={key.replace('__', '.')}={json.dumps(value)}" for key, value in changes.items()]
-    with program(system, *settings) as (process, port):
-        config = tmp_path / "mission.toml"
-        config.write_text(f'system = "{system}"\n' + toml_of(PIONEER | changes, port))
-        run = [sys.executable, "-m", "ccatp", "run", "--config", str(config), "--json"]
-        run += ["--run-dir", str(tmp_path / "run"), "--runtime-dir", str(runtime_dir)]
-        done = subprocess.run(run, env=os.environ | NO_REPORT, capture_output=True, text=True, timeout=900, check=False)
+    with program(system, *options("set", changes)) as (process, port):
+        summary = run_mission(tmp_path, runtime_dir, system, changes, port)
         process.terminate()
         assert process.stdout is not None
         truth = {row[0]: row[2:4] for row in json.loads(process.stdout.read())}
-    assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
-    assert summary["outcome"] == "complete"
     begun_s = summary["map"].get("map_time_s") or 0.0  # before it has mapped motes, the robot stands at its start
     track = open_beacons(tmp_path / "run").track()
     rows = [k for k, seq in enumerate(track["frame"]) if seq in truth and track["t_s"][k] >= begun_s]

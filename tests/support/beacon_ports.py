@@ -3,7 +3,7 @@
 Each serial device is a pseudo terminal, ``FOLDER/base``, ``radio`` or ``mote-NAME``; the lines of the dish are the
 socket ``FOLDER/gpio``; ``FOLDER/robot.toml`` is the configuration of ``ccatp onboard`` for them. Standard output gets a
 line ``ready``, then ``moves`` and ``stands`` with the time of ``monotonic`` whenever the wheels begin and end to turn,
-and at SIGTERM the truth of each 0.1 s: UTC, x, y and heading. A line on standard input changes a device:
+and at SIGTERM the truth of each step of the world: UTC, x, y and heading. A line on standard input changes a device:
 ``unplug base``, ``plug base``, ``set base is_mute true``.
 """
 
@@ -23,7 +23,7 @@ from typing import Any
 import tomlkit
 
 from ccatp.beacons.config.onboard_models import BeaconOnboardConfig
-from tests.support.beacon_fakes import CYCLE_S, FakeDish, FakePort
+from tests.support.beacon_fakes import FakeDish, FakePort
 from tests.support.beacon_rig import BeaconBench, onboard_config, pioneer_config
 from tests.support.onboard_fakes import FakeTime
 
@@ -118,7 +118,7 @@ class FakeDevices:
         }
         self._lines = Lines(bench.dish, folder / "gpio")
         self._is_over = self._moves = False
-        self._next_s = time.monotonic()
+        self._stepped_s = 0.0
         self.truth: list[tuple[float, ...]] = []
         signal.signal(signal.SIGTERM, lambda *_: setattr(self, "_is_over", True))
 
@@ -148,10 +148,10 @@ class FakeDevices:
         if (moves := bool(base.velocity or base.turn)) != self._moves:
             self._moves = moves
             print("moves" if moves else "stands", time.monotonic(), flush=True)
-        if (now_s := time.monotonic()) >= self._next_s:
-            self._next_s += CYCLE_S
-            if now_s < self._next_s:
-                self.truth.append((time.time(), *self._bench.world.pose))
+        world = self._bench.world
+        if world.time_s > self._stepped_s:
+            self._stepped_s = world.time_s
+            self.truth.append((time.time(), *world.pose))
 
 
 def config_at(folder: Path, cfg: BeaconOnboardConfig) -> str:

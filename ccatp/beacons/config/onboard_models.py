@@ -17,7 +17,9 @@ from ccatp.config.robot_limits import VEHICLE_FRAME_HZ, WheelBase, WheelRadius
 
 ListenerName = Annotated[Name, Field(max_length=16)]  # many of them share a line of the link
 Baud = Annotated[int, Field(ge=1200, le=921_600)]
-Celsius = Annotated[float, Field(ge=-60.0, le=80.0)]
+COLDEST_C, HOTTEST_C = -60.0, 80.0  # that a thermometer of a robot may show
+Celsius = Annotated[float, Field(ge=COLDEST_C, le=HOTTEST_C)]
+SCAN_LEVELS = 800  # of a scan, which must not exceed the limit of a line of the link
 _STEPS_OF_WATCHDOG = 5  # of the control loop, in the time of the base's watchdog: one may be late
 
 
@@ -137,6 +139,7 @@ def check_beacon_onboard_config(cfg: BeaconOnboardConfig) -> Iterator[ConfigProb
          f"stops a loop with steps of {1.0 / body.loop_hz:g} s; allow {least_s:g} at least", "robot.loop_hz"),
         (base.battery_empty_v >= base.battery_full_v, "devices.base.battery_empty_v",
          "must be below devices.base.battery_full_v", "devices.base.battery_full_v"),
+        (len(set(base.sonars)) < len(base.sonars), "devices.base.sonars", "names a sonar twice"),
         (len(base.sonars) != len(base.sonars_rad), "devices.base.sonars_rad", "needs a direction for each of sonars",
          "devices.base.sonars"),
         (dish.is_used and not devices.radio.is_used, "devices.dish.is_used", "needs devices.radio",
@@ -145,6 +148,11 @@ def check_beacon_onboard_config(cfg: BeaconOnboardConfig) -> Iterator[ConfigProb
          f"must divide steps_per_turn = {dish.steps_per_turn}", "devices.dish.steps_per_turn"),
         (len({dish.step_line, dish.direction_line, dish.switch_line}) < 3, "devices.dish.step_line",
          "names a line twice", "devices.dish.direction_line", "devices.dish.switch_line"),
+        (dish.is_used and len(devices.radio.names) * dish.positions > SCAN_LEVELS, "devices.radio.names",
+         f"times devices.dish.positions exceeds {SCAN_LEVELS} levels, which a line of the link can hold",
+         "devices.dish.positions"),
+        (not any(one.is_used for one in (base, devices.radio, devices.listeners)), "devices.base.is_used",
+         "is false, as of all other devices", "devices.radio.is_used", "devices.listeners.is_used"),
         (devices.listeners.is_used and not devices.listeners.devices, "devices.listeners.devices",
          "names no listener", "devices.listeners.is_used"),
     ):  # fmt: skip

@@ -9,7 +9,7 @@ import re
 from collections import Counter
 from typing import NamedTuple
 
-LONGEST_LINE = 256
+LONGEST_LINE, LONGEST_NAME = 256, 16  # a space id has at most 8 letters
 SLOWEST_M_S, FASTEST_M_S = 300.0, 370.0  # speed of sound between -50 and 70 degrees
 LONGEST_FLIGHT_S = 0.045  # after which a mote waits for no pulse
 _UNITS_M = (0.01, 0.0254)
@@ -51,7 +51,7 @@ def parse_pulse(text: str) -> Pulse | None:
     pairs = [field.strip().partition("=") for field in text.strip().split(",")]
     fields = {_OLD.get(name, name): value for name, _, value in pairs}
     is_old, last = "ver" in fields, pairs[-1][0]  # a line of version 1 may end with the time of flight
-    if not {"ID", "DR"} <= set(fields):
+    if not {"ID", "DR"} <= set(fields) or len(fields.get("SP", "")) > LONGEST_NAME:
         return None
     if not is_old and (last in {"ID", "SP", "DR"} or not _ID.fullmatch(fields["ID"])):
         return None
@@ -72,8 +72,8 @@ class LineReader:
 
     Attributes:
         report: what the mote said of itself.
-        counts: ``pulses``, ``silent`` (a radio message without a pulse), ``garbled``, ``duplicates``,
-            ``reports`` (lines that say something of the mote), ``other`` lines.
+        counts: ``pulses``, ``silent`` (a radio message without a pulse), ``garbled`` (damaged, or without an
+            end), ``duplicates``, ``reports`` (lines that say something of the mote), ``other`` lines.
     """
 
     def __init__(self) -> None:
@@ -85,7 +85,9 @@ class LineReader:
     def feed(self, data: bytes) -> list[Pulse]:
         """The pulses of each line that is complete now; call ``finish`` at the end of a file."""
         *lines, self._rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
-        self._rest = self._rest[-LONGEST_LINE:]
+        if len(self._rest) > LONGEST_LINE:
+            self._rest = b""
+            self.counts["garbled"] += 1
         return [pulse for line in lines for pulse in self._read(line)]
 
     def finish(self) -> list[Pulse]:

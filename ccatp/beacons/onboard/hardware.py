@@ -124,10 +124,8 @@ class BeaconHardware:
         if self.radio is not None and self.scanner is not None:
             self.radio.poll(now_s)
             self.scanner.poll(now_s)
-            if not self.radio.is_ready:
-                faults["radio"] = self.radio.why()
-            elif missing := self.radio.missing:
-                faults["radio"] = f"does not hear {', '.join(missing)}"
+            if reason := self.radio.fault() or self.scanner.silence:
+                faults["radio"] = reason
             if self.scanner.fault:
                 faults["dish"] = self.scanner.fault
         motes: list[MoteBurst] = []

@@ -2,7 +2,7 @@
 
 from math import inf
 
-from ccatp.beacons.config.onboard_models import ListenersConfig
+from ccatp.beacons.config.onboard_models import COLDEST_C, HOTTEST_C, ListenersConfig
 from ccatp.beacons.links.cricket_lines import LineReader
 from ccatp.beacons.links.messages import MoteBurst
 from ccatp.beacons.onboard.recognition import BeaconDevice
@@ -13,6 +13,7 @@ from ccatp.onboard.hardware import HardwareError
 ASK_S = 2.0  # of silence, after which the mote is asked for its report
 REPORT_S = 60.0  # between two reports: they hold the temperature
 _REPORT_COMMAND = b"\rG CF\r"
+_USELESS = 10  # damaged and repeated lines without one that is right, which are a fault
 _DIGITS = 6
 
 
@@ -34,6 +35,7 @@ class CricketListener(BeaconDevice):
         self._bursts: list[MoteBurst] = []
         self._ask_s = self._report_s = 0.0
         self._heard_s = -inf
+        self._useless_before = 0  # the newest pulse
 
     @property
     def is_ready(self) -> bool:
@@ -46,14 +48,27 @@ class CricketListener(BeaconDevice):
         return bursts
 
     def fault(self, now_s: float) -> str:
-        """The reason if it has sent nothing for ``timeout_s``; empty otherwise."""
+        """The reason if it has sent nothing for ``timeout_s``, or nothing that is right; empty otherwise."""
         if self._line.is_open and now_s - self._heard_s <= self._config.timeout_s:
+            if self._useless - self._useless_before >= _USELESS:
+                return "its lines are damaged or repeated; check its output format (3) and its cable"
+            if not self._is_temperature_possible:
+                return f"its thermometer shows {self.reader.report.temperature_c:g} degrees; switch it off (P TP 0)"
             return ""
-        return f"{self.title}: {self.why()}"
+        return self.why()
+
+    @property
+    def _useless(self) -> int:
+        return self.reader.counts["garbled"] + self.reader.counts["duplicates"]
+
+    @property
+    def _is_temperature_possible(self) -> bool:
+        temperature_c = self.reader.report.temperature_c
+        return temperature_c is None or COLDEST_C <= temperature_c <= HOTTEST_C
 
     def _begin(self, now_s: float) -> None:
         super()._begin(now_s)
-        self.reader = LineReader()
+        self.reader, self._useless_before = LineReader(), 0
         self._identity = ""
         self._ask(now_s)
 
@@ -72,10 +87,13 @@ class CricketListener(BeaconDevice):
             self._identity = f"Cricket {report.unique_id} {report.space or ''}".strip()
         if pulses or reader.counts["silent"] + reader.counts["reports"] > before:
             self._heard_s = now_s
+            self._useless_before = self._useless if pulses else self._useless_before
             self._line.accept(now_s)
             self._line.recover()
             self._ask_s = now_s + ASK_S
-        temperature_c = report.temperature_c if report.temperature_c is not None else self._config.temperature_c
+        temperature_c = report.temperature_c
+        if temperature_c is None or not self._is_temperature_possible:
+            temperature_c = self._config.temperature_c
         t_s = round(now_s, _DIGITS)
         self._bursts += [MoteBurst(t_s, one.sender, self.name, temperature_c, [one.delay_s]) for one in pulses]
         if now_s >= min(self._ask_s, self._report_s):

@@ -6,6 +6,7 @@ as travel (mm/s) and turn (degrees/s), which are finer than ``VEL2`` (20 mm/s); 
 the next command.
 """
 
+from collections import deque
 from math import inf, pi
 
 from ccatp.beacons.config.onboard_models import BaseDeviceConfig, BeaconBodyConfig
@@ -45,6 +46,8 @@ _ENABLE_S = 1.0  # in which the base enables its motors
 _DISAGREES = 0.5  # of the base's own speed, by which the encoders may differ from it
 _FAST_MM_S = 60.0  # speeds above are compared
 _CONTINUOUS = 2
+_IMPOSSIBLE = 3.0  # times the highest set point: no wheel turns so fast, a count was damaged
+_JUMPS, _JUMPS_S = 3, 10.0  # so many within this time are a fault; a damaged count gives two, there and back
 
 WheelSpeeds = tuple[float, float | None, float | None]  # time; mean speed of the right and left wheel since the last
 
@@ -66,10 +69,13 @@ class PioneerBase(BeaconDevice):
         super().__init__((config.device, config.baud), open_port, clock, sleep)
         self._config = config
         self._radius_m, self._track_m = body.wheel_radius_m, body.track_m
+        self._impossible_rad_s = _IMPOSSIBLE * body.max_wheel_rad_s
+        self._jumps_s: deque[float] = deque(maxlen=_JUMPS)
         self.reader = PacketReader()
         self._stage = SYNC0
         self._ask_s = self._enable_s = self._standard_s = self._counts_s = -inf
         self._last: tuple[int, int] | None = None
+        self._new_counts: tuple[int, int] | None = None
         self._samples: list[WheelSpeeds] = []
         self._rates = 0.0, 0.0  # newest, right and left
         self._rest = [0.0, 0.0]
@@ -106,6 +112,9 @@ class PioneerBase(BeaconDevice):
         for packet in self.reader.feed(data):
             self._line.accept(now_s)
             self._take_packet(packet, now_s)
+        if self._new_counts is not None:  # of several packets in one reading the last one: nobody knows their times
+            self._take_counts(self._new_counts, now_s)
+            self._new_counts = None
         if self._stage < _RUNS and now_s >= self._ask_s:
             self._ask_s = now_s + ASK_S
             self._line.write(format_command(self._stage) if self._stage <= SYNC2 else format_command(CONFIG))
@@ -143,7 +152,7 @@ class PioneerBase(BeaconDevice):
         elif (standard := parse_standard(packet)) is not None:
             self._take_standard(standard, now_s)
         elif (counts := parse_encoders(packet)) is not None:
-            self._take_counts(counts, now_s)
+            self._new_counts = counts
 
     def _take_standard(self, standard: Standard, now_s: float) -> None:
         config = self._config
@@ -170,11 +179,15 @@ class PioneerBase(BeaconDevice):
         last, last_s = self._last, self._counts_s
         self._last, self._counts_s = counts, now_s
         self._line.recover()
-        if last is None or now_s - last_s > self._config.timeout_s or now_s <= last_s:
+        if last is None or now_s - last_s > self._config.timeout_s:
             return  # a gap: the speeds within it are not known
         per_rad = 1e3 * self._radius_m * self._config.counts_per_mm
         left, right = (wrapped_change(now, before) for now, before in zip(counts, last, strict=True))
-        self._rates = right / per_rad / (now_s - last_s), left / per_rad / (now_s - last_s)
+        rates = right / per_rad / (now_s - last_s), left / per_rad / (now_s - last_s)
+        if max(map(abs, rates)) > self._impossible_rad_s:
+            self._jumps_s.append(now_s)
+            return
+        self._rates = rates
         self._samples.append((now_s, *self._rates))
 
     # -- the robot ----------------------------------------------------------------------------------------------------
@@ -218,6 +231,8 @@ class PioneerBase(BeaconDevice):
         age_s = now_s - max(min(self._counts_s, self._standard_s), -1e6)
         if self._stage != _RUNS or age_s > self._config.timeout_s:
             return f"no packet for {age_s:.2f} s: {self.why()}" if self._counts_s > -inf else self.why()
+        if len(self._jumps_s) == _JUMPS and now_s - self._jumps_s[0] < _JUMPS_S:
+            return "the encoders show impossible speeds; check their cables, and devices.base.counts_per_mm"
         if self._doubts >= 10:
             return "the encoders contradict the speeds of the base; correct devices.base.counts_per_mm"
         return ""

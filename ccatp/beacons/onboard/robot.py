@@ -25,7 +25,8 @@ from ccatp.onboard.rules import HELD
 NEEDED = ("encoder_right", "encoder_left", "edge", "stall")
 _ON_LINK = (*NEEDED, "battery_low")
 _CORNER = (0.0, 0.0)  # reported place of the edge sensors, which it does not have
-_LINE_PULSES = 100  # in a line: with the longest names they have three quarters of the line's limit
+# Pulses in a line, with the longest names: without and with a scan they have three and one quarter of the line's limit.
+_LINE_PULSES, _LINE_PULSES_OF_SCANS = 100, 35
 _NOTHING = ScanResult(None, [])
 
 
@@ -45,6 +46,7 @@ class BeaconOnboardRobot(ControlledRobot):
         self._driven_s = 0.0  # since the newest scan
         self._stands, self._stands_since_s = hardware.base is None, 0.0  # the wheels, since when
         self._stall, self._soc = "", 1.0
+        self._line_pulses = _LINE_PULSES if hardware.scanner is None else _LINE_PULSES_OF_SCANS
         self.scans_due = False
         # What is not in a frame yet.
         self._enc: list[WheelSpeeds] = []
@@ -159,7 +161,7 @@ class BeaconOnboardRobot(ControlledRobot):
             radio=radio,
             scan=scan,
             distances=[round(distance_m, 3) for distance_m in self._distances_m],
-            motes=self._take_samples(self._motes, since_s, _LINE_PULSES),
+            motes=self._take_samples(self._motes, since_s, self._line_pulses),
         )
         self._line = with_extras(encode(frame), extras)
         self.delivered_seq = self.seq

@@ -9,7 +9,7 @@ from enum import Enum, auto
 from math import tau
 from typing import NamedTuple
 
-from ccatp.beacons.config.onboard_models import DishConfig
+from ccatp.beacons.config.onboard_models import SCAN_LEVELS, DishConfig
 from ccatp.beacons.links.messages import RadioSample, RadioScan
 from ccatp.beacons.onboard.dish import Dish
 from ccatp.beacons.onboard.xbee import Coordinator
@@ -18,6 +18,13 @@ from ccatp.onboard.hardware import HardwareError
 
 REOPEN_S = 2.0  # between two attempts to open the lines of the dish
 _DIGITS = 6
+_SILENT_POSITIONS = 5  # without any level, which are reported before the end of the scan
+_FAILURES = {
+    "lost": "requests without an answer",
+    "failed": "requests not delivered",
+    "mixed": "answers with another packet behind them",
+    "none": "answers without a possible strength",
+}
 
 
 class Phase(Enum):
@@ -43,6 +50,7 @@ class Scanner:
 
     Attributes:
         fault: reason why no scan is possible now; empty if it is.
+        silence: of which radios the newest scan has no level, and why; empty if it has a level of each.
         interrupted: reason of the newest scan that gave nothing.
         counts: ``scans``, ``interrupted``.
     """
@@ -59,7 +67,8 @@ class Scanner:
         self._directions = 1 if dish is None else config.positions
         self._step_s = self._settled_s = self._reopen_s = 0.0
         self._result: ScanResult | None = None
-        self.fault = self.interrupted = ""
+        self.fault = self.interrupted = self.silence = ""
+        self._failures: Counter[str] = Counter()  # of requests before the scan
         self.counts: Counter[str] = Counter(scans=0, interrupted=0)
 
     @property
@@ -101,7 +110,8 @@ class Scanner:
 
     def begin(self) -> None:
         """Begin a scan of the radios that are known now."""
-        self._levels = {name: [] for name in self._coordinator.wanted}
+        self._levels = {name: [] for name in self._coordinator.wanted[: SCAN_LEVELS // self._directions]}
+        self._failures = self._coordinator.counts.copy()
         self._at, self._resets, self._phase = 0, self._coordinator.resets, Phase.TURNING
 
     def interrupt(self, reason: str) -> None:
@@ -109,6 +119,7 @@ class Scanner:
         if not self.is_scanning or not self._levels:
             return
         self.interrupted = reason
+        self.silence = f"the newest scan gave nothing: {reason}"
         self.counts["interrupted"] += 1
         self._levels = {}
         self._phase = Phase.READY if self._dish is None else Phase.RETURNING
@@ -190,6 +201,8 @@ class Scanner:
                 self.interrupt(f"radio: {error}")
             return
         self._at += 1
+        if self._at == _SILENT_POSITIONS and not any(any(levels) for levels in self._levels.values()):
+            self._note_silence()
         if self._at < self._directions:
             self._phase = Phase.TURNING
         elif self._dish is not None:
@@ -198,10 +211,17 @@ class Scanner:
             self._phase = Phase.READY
             self._finish(now_s)
 
+    def _note_silence(self) -> None:
+        silent = [name for name in self._coordinator.wanted if not any(self._levels.get(name, ()))]
+        failures = self._coordinator.counts - self._failures
+        why = ", ".join(f"{count} {_FAILURES[name]}" for name, count in failures.items())
+        self.silence = f"no level of {', '.join(silent)}: {why or 'too many radios for a frame'}" if silent else ""
+
     def _finish(self, now_s: float) -> None:
         """Radios that did not answer once are left out."""
         self.counts["scans"] += 1
         heard = {name: levels for name, levels in self._levels.items() if any(z is not None for z in levels)}
+        self._note_silence()
         t_s = round(now_s, _DIGITS)
         if self._dish is None:
             samples = [RadioSample(t_s, name, z, None) for name, (z,) in heard.items() if z is not None]

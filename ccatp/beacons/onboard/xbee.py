@@ -5,6 +5,7 @@ name; after its answer the module is asked for ``DB``. The strength counts only 
 no other packet came in between, and no module relays the packets of this radio.
 """
 
+from collections import Counter
 from math import inf
 from typing import NamedTuple
 
@@ -58,8 +59,10 @@ class Coordinator(BeaconDevice):
     Attributes:
         radios: serial numbers of the radios that were found, by name.
         relayed: names of radios whose packets are relayed.
+        twins: names that several radios have; none of them is measured.
         resets: of the module.
-        mixed: strengths that were dropped because another packet came in between.
+        counts: requests without a strength: ``lost`` (no answer), ``failed`` (not transmitted, or refused), ``mixed``
+            (another packet came in between), ``none`` (the module has no strength that can be).
         reader: of the received bytes.
     """
 
@@ -76,13 +79,16 @@ class Coordinator(BeaconDevice):
         self._ask_s = self._discover_s = -inf
         self._discovery_until_s: float | None = None
         self._discovery_id = 0
+        self._found: dict[str, int] = {}  # in the newest discovery
         self._is_found = False
         self._request: _Request | None = None
         self._result: Strength | None = None
         self._now_s = 0.0
         self.radios: dict[str, int] = {}
         self.relayed: set[str] = set()
-        self.resets = self.mixed = 0
+        self.twins: set[str] = set()
+        self.resets = 0
+        self.counts: Counter[str] = Counter(lost=0, failed=0, mixed=0, none=0)
 
     @property
     def is_ready(self) -> bool:
@@ -103,7 +109,19 @@ class Coordinator(BeaconDevice):
     def wanted(self) -> list[str]:
         """Radios of which strengths are measured."""
         names = self._config.names or tuple(sorted(self.radios))
-        return [name for name in names if name in self.radios and name not in self.relayed]
+        return [name for name in names if name in self.radios and name not in self.relayed | self.twins]
+
+    def fault(self) -> str:
+        """The reason why radios cannot be measured; empty if all can."""
+        if not self.is_ready:
+            return self.why()
+        if self.missing:
+            return f"does not hear {', '.join(self.missing)}"
+        if self.twins:
+            return f"several radios have the name {', '.join(sorted(self.twins))}; set NI of each to another one"
+        if self.relayed:
+            return f"the packets of {', '.join(sorted(self.relayed))} are relayed: their strength is not their own"
+        return ""
 
     def ask(self, name: str, now_s: float) -> None:
         """Begin the request of the strength of a radio; ``take`` gives the result. Raises OSError."""
@@ -159,12 +177,13 @@ class Coordinator(BeaconDevice):
             self._discover_s = now_s + DISCOVER_AGAIN_S
             self._discovery_until_s = now_s + self._config.discovery_s
             self._discovery_id = self._next_id()
+            self._found, self.twins = {}, set()
             self._send(format_at(self._discovery_id, b"ND"))
         if self._request is None and now_s >= max(self._line.valid_s, self._ask_s) + ASK_S:
             self._ask_s = now_s  # the line is silent: is the module still there?
             self._send(format_at(self._next_id(), b"AP"))
         if self._request is not None and now_s > self._request.until_s:
-            self._try_again(self._request)
+            self._try_again(self._request, "lost")
 
     def _take_message(self, message: Message, kind: int) -> None:
         request = self._request
@@ -182,14 +201,13 @@ class Coordinator(BeaconDevice):
         if request is None or not (kind in BY_RADIO or is_node):
             return
         if request.has_answered:
-            self.mixed += 1
-            self._try_again(request)
+            self._try_again(request, "mixed")
         elif isinstance(message, RemoteResponse) and (message.frame_id, message.address) == (
             request.frame_id,
             request.address,
         ):
             if message.status != OK:
-                self._try_again(request)
+                self._try_again(request, "failed")
                 return
             frame_id, until_s = self._next_id(), self._now_s + self._config.answer_timeout_s
             self._request = request._replace(frame_id=frame_id, until_s=until_s, has_answered=True)
@@ -198,6 +216,8 @@ class Coordinator(BeaconDevice):
     def _take_answer(self, answer: AtResponse, request: _Request | None) -> None:
         if answer.command == b"ND":
             if answer.frame_id == self._discovery_id and (node := parse_node(answer.data)) is not None:
+                if self._found.setdefault(node.name, node.address) != node.address:
+                    self.twins.add(node.name)
                 self.radios[node.name] = node.address
                 (self.relayed.add if node.is_relayed else self.relayed.discard)(node.name)
         elif answer.command == b"DB" and request is not None and request.has_answered:
@@ -205,6 +225,7 @@ class Coordinator(BeaconDevice):
                 level = answer.data[-1] if answer.status == OK and answer.data else 0
                 name = request.name
                 is_own = 0 < level <= WEAKEST_DBM and name not in self.relayed  # 0: it has received nothing yet
+                self.counts["none"] += not is_own
                 self._request, self._result = None, Strength(name, -float(level) if is_own else None)
         elif answer.status == OK and answer.command in _QUESTIONS:
             self._answers[answer.command] = answer.data
@@ -217,7 +238,8 @@ class Coordinator(BeaconDevice):
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
-    def _try_again(self, request: _Request) -> None:
+    def _try_again(self, request: _Request, why: str) -> None:
+        self.counts[why] += 1
         if request.tries_left > 1:
             self._send_request(request.name, request.address, request.tries_left - 1, self._now_s)
         else:

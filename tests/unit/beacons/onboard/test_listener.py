@@ -75,7 +75,7 @@ def test_pulled_and_plugged() -> None:
     rig = Rig().open()
     rig.device.unplug()
     rig.run(1.0)
-    assert rig.listener.fault(rig.time.now_s) == "listener robot: /dev/ttyX: is not there; check the wiring"
+    assert rig.listener.fault(rig.time.now_s) == "/dev/ttyX: is not there; check the wiring"
     rig.device.plug()
     rig.run(5.0)
     rig.device.pulse(ID, "ship", 0.002)

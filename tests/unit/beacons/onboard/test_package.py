@@ -93,6 +93,15 @@ def test_the_installed_command_is_there(site: Path) -> None:
          "ccatp: radio: /dev/nowhere: is not there; check the wiring"),
         ("devices.dish.positions = 7", 2, "devices.dish.positions must divide steps_per_turn = 200"),
         ("devices.radio.bauds = 9600", 2, "devices.radio.bauds"),
+        ("devices.radio.is_used = false", 2, "devices.dish.is_used needs devices.radio"),
+        ("devices.base.is_used = false\ndevices.radio.is_used = false\ndevices.dish.is_used = false", 2,
+         "devices.base.is_used is false, as of all other devices"),
+        ("devices.base.sonars = [1, 1, 2, 3, 4, 5, 6, 7]", 2, "devices.base.sonars names a sonar twice"),
+        (f"devices.radio.names = {[f'b{k}' for k in range(21)]}", 2,
+         "devices.radio.names times devices.dish.positions exceeds 800 levels"),
+        ("devices.base.baud = 300", 2, "devices.base.baud"),
+        ("devices.radio.api_mode = 0", 2, "devices.radio.api_mode"),
+        ("devices.base.most_watchdog_s = 0.01", 2, "devices.base.most_watchdog_s stops a loop"),
     ],
 )  # fmt: skip
 def test_started_bare_it_names_what_is_missing(

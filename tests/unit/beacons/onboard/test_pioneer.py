@@ -199,9 +199,12 @@ def test_any_byte_of_a_packet_may_get_lost(rig: Rig) -> None:
 
 
 def test_encoders_that_contradict_the_base_are_a_fault() -> None:
-    rig = Rig(counts_per_mm=12.8).open()
+    rig = Rig(counts_per_mm=60.0).open()
     rig.run(3.0, 2.0, 2.0)
     assert "contradict the speeds of the base; correct devices.base.counts_per_mm" in rig.base.fault(rig.time.now_s)
+    rig = Rig(counts_per_mm=12.8).open()
+    rig.run(3.0, 2.0, 2.0)
+    assert rig.base.fault(rig.time.now_s).startswith("the encoders show impossible speeds; check their cables")
 
 
 def _set(**values: object) -> Callable[[Rig], FakePort]:

@@ -78,7 +78,7 @@ def packet_of_another(rig: Rig, kind: int = 0x90) -> Callable[[], None]:
 def test_a_packet_in_between_is_no_measurement(kind: int) -> None:
     rig = Rig(tries=1).open()
     assert rig.ask("beacon1", packet_of_another(rig, kind)) is None
-    assert rig.radio.mixed == 1
+    assert rig.radio.counts["mixed"] == 1
     rig = Rig(tries=2).open()
     assert rig.ask("beacon1", packet_of_another(rig, kind)) == -40.0  # the second request is alone
 
