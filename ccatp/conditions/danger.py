@@ -45,18 +45,18 @@ _RATE = "{sensor} deliver {rate} samples/s, at least {least} are needed"
 _FIRMWARE = "Set the rate in the robot's firmware; the sensor and its cable work."
 SENSOR_MUCH_TOO_SLOW = hold("sensor_much_too_slow", Owner.DANGER, 10, Group.SENSORS, _RATE,
     "Encoders or edge sensors deliver less than half of what is needed. The robot stands.", _FIRMWARE,
-    trusts_wheels=True, then="set the sensor's rate in the robot's firmware")
+    trusts_wheels=True, unit="Hz", then="set the sensor's rate in the robot's firmware")
 SENSOR_TOO_SLOW = slow("sensor_too_slow", Owner.DANGER, 20, Group.SENSORS, _RATE,
-    "The sample rate is lower than needed at full speed. The robot continues at half its speed.", _FIRMWARE)
+    "The sample rate is lower than needed at full speed. The robot continues at half its speed.", _FIRMWARE, unit="Hz")
 
 # -- wheels and encoders ----------------------------------------------------------------------------------------------
 
 ENCODER_BROKEN = hold("encoder_broken", Owner.DANGER, 30, Group.WHEELS, "the {side} encoder {what}",
     "One encoder repeats itself, or gives no values, while the wheel must turn. The robot takes a fix and continues; "
-    "repeated, it is a fault.", "Check its cable.", then="check the encoder's cable")
+    "repeated, it is a fault.", "Check its cable.", unit="m/s", then="check the encoder's cable")
 WHEEL_RUNS_AWAY = hold("wheel_runs_away", Owner.DANGER, 40, Group.WHEELS, "the {side} wheel runs away",
     "It turns faster than commanded.", "Remove the robot: the servo fails.",
-    actor=Actor.OPERATOR, then="remove the robot: its servo fails")
+    actor=Actor.OPERATOR, unit="m/s", then="remove the robot: its servo fails")
 WHEEL_SPEED_WRONG = hold("wheel_speed_wrong", Owner.DANGER, 50, Group.WHEELS,
     "the {side} wheel turns {ratio} times as fast as commanded",
     "By regression over `health.ratio_time_s`, the speed by its encoder is not within 1 +- `health.ratio_share` of the "
@@ -70,27 +70,27 @@ WHEELS_STAND = hold("wheels_stand", Owner.DANGER, 60, Group.WHEELS, "both wheels
 ENCODER_COUNTS_NOTHING = hold("encoder_counts_nothing", Owner.DANGER, 70, Group.WHEELS,
     "the {side} encoder counts nothing",
     "By the gyroscope the wheel turns, by its encoder it does not.", "Check the encoder's cable and disc.", retries=1,
-    then="check the encoder's cable and disc")
+    unit="m/s", then="check the encoder's cable and disc")
 WHEEL_BLOCKED = hold("wheel_blocked", Owner.DANGER, 80, Group.WHEELS, "the {side} wheel is blocked",
     "It was commanded to turn and stands still; the gyroscope agrees.", "Look for an obstacle.", retries=1,
-    then="look for an obstacle at the wheel")
+    unit="m/s", then="look for an obstacle at the wheel")
 WHEEL_CREEPS = hold("wheel_creeps", Owner.DANGER, 90, Group.WHEELS, "the {side} wheel turns while it is held",
     "The robot creeps. Fans to their maximum; a fault if it continues.", "Hold the robot; check fans, brake, slope.",
-    full_fans=True, then="hold the robot by hand; check fans, brake and slope")
+    full_fans=True, unit="m", then="hold the robot by hand; check fans, brake and slope")
 WHEEL_CREEPS_ON = fault("wheel_creeps_on", Owner.DANGER, 100, Group.WHEELS, "the {side} wheel turns while it is held",
     "The robot has crept for a second. Fans to their maximum.",
     "Hold the robot; check fans, brake, slope.", full_fans=True,
-    then="hold the robot by hand; check fans, brake and slope")
+    unit="m", then="hold the robot by hand; check fans, brake and slope")
 WHEEL_DOES_NOT_STOP = hold("wheel_does_not_stop", Owner.DANGER, 110, Group.WHEELS,
     "the {side} wheel turns though it shall stand",
     "The servo does not come to rest.", "If it repeats, remove the robot: the servo fails.",
-    then="remove the robot: its servo fails")
+    unit="m/s", then="remove the robot: its servo fails")
 GRIP_LOST = hold("grip_lost", Owner.DANGER, 120, Group.WHEELS,
     "the robot loses its grip: it slides downhill over its wheels",
     "Accelerometer and gyroscope show a slide along gravity, its wheels do not. Wheels held, fans to their maximum; "
     "a fault if it slides again within `health.retry_window_s`.",
     "Tyres or mirror oily? Too little thrust for the slope: see `ccatp plan`.", full_fans=True, retries=0,
-    then="secure the robot by hand; clean tyres and mirror")
+    unit="m/s", then="secure the robot by hand; clean tyres and mirror")
 GRIP_TOO_LITTLE = fault("grip_too_little", Owner.DANGER, 130, Group.WHEELS,
     "too little grip by the creep of turns: the fans do not hold it everywhere",
     "The friction measured in turns, at the start and at each fix after a turn, is too small even for full thrust.",
@@ -103,7 +103,7 @@ GRIP_LITTLE = slow("grip_little", Owner.DANGER, 140, Group.WHEELS,
 YAW_DISAGREES = hold("yaw_disagrees", Owner.DANGER, 150, Group.SENSORS,
     "gyroscope and wheels disagree about the turn: a wheel slips, or the gyroscope is off",
     "They disagree by more than slip and scale errors explain. The robot takes a fix.",
-    "Wheels or mirror oily? Otherwise check the gyroscope.", unit="rad/s",
+    "Wheels or mirror oily? Otherwise check the gyroscope.", unit="rad",
     then="check the gyroscope; clean wheels and mirror")
 TURN_TIMES_DIFFER = hold("turn_times_differ", Owner.DANGER, 155, Group.SENSORS,
     "by their time stamps the gyroscope shows turns at least {ms} ms {side} than the encoders",
@@ -142,7 +142,7 @@ SAMPLES_MISDATED = inform("samples_misdated", Owner.DANGER, 230, Group.LINK,
     "samples of the {sensor} are {side} their frame: not used",
     "A sample is later than its frame by more than 1 ms, or older by more than 1 s, so its time is not known. What is "
     "not used is missing: see the alarms about samples that are stale.",
-    "Check how the firmware stamps its samples. After a stall of the robot's computer nothing, unless it repeats.")
+    "Check how the firmware stamps its samples. After a stall of the robot's computer nothing, unless it repeats.", unit="s")
 FRAMES_LOST = hold("frames_lost", Owner.DANGER, 240, Group.DATA, "frames were lost while the robot may have moved",
     "A gap in the frames while the robot moved. The robot takes a fix.", "If it repeats, check the network.", unit="s",
     then="check the network")
@@ -252,22 +252,23 @@ EDGE_SENSOR_STAYS_OFF = hold("edge_sensor_stays_off", Owner.DANGER, 500, Group.S
     "an edge sensor stays off though it was moved back and the others are on",
     "The sensor fails, unless a fix, taken at once, shows a seam or the rim there: then the robot continues by itself.",
     "Clean or replace it. `ccatp resume` continues if it is on again.", action=Action.LOCATE, trusts_wheels=True,
-    actor=Actor.OPERATOR, then="clean or replace the edge sensor")
+    actor=Actor.OPERATOR, unit="m", then="clean or replace the edge sensor")
 RIM_AHEAD = edge("rim_ahead", Owner.DANGER, 510, Group.EDGES, "rim ahead on the map",
     "A sensor hangs over where the map has the rim.",
     "Nothing. If it repeats there: is the robot's pose plausible, is the base where the configuration has it?",
-    then="look at the robot's place on the mirror")
+    unit="m", then="look at the robot's place on the mirror")
 BEYOND_SEAM = edge("beyond_seam", Owner.DANGER, 520, Group.EDGES, "further off the panel than the seam is wide",
     "A sensor has been off over a longer way than the gap of the map there.",
-    "Is a panel missing, or the gap wider than `mirror.panels.gap_mm`?", then="look whether a panel is missing there")
+    "Is a panel missing, or the gap wider than `mirror.panels.gap_mm`?", unit="m",
+    then="look whether a panel is missing there")
 NO_SEAM = edge("no_seam", Owner.DANGER, 530, Group.EDGES, "off the panel where the map has no seam",
     "A sensor went off in the middle of a panel: a hole, a dark spot, or a pose that is wrong.",
     "Look at the place. A dirty sensor does this everywhere, a wrong pose near seams.",
-    then="look at the place, and at the edge sensor")
+    unit="m", then="look at the place, and at the edge sensor")
 OFF_WITHOUT_WHEELS = edge("off_without_wheels", Owner.DANGER, 540, Group.EDGES,
     "off the panel while no encoder samples are received",
     "A sensor is off, and the distance that the robot has moved is not known.",
-    "See the encoder's alarm.", then="check the robot's encoders")
+    "See the encoder's alarm.", unit="m", then="check the robot's encoders")
 CENTRE_NEAR_RIM = edge("centre_near_rim", Owner.DANGER, 550, Group.EDGES,
     "the robot's centre is close to the rim on the map",
     "By its pose the robot is about to drive over the rim; no sensor has gone off yet.",

@@ -173,42 +173,42 @@ class WheelMonitor(Monitor):
         return SetPointSpan(t_s, 0.0, 0.0, 0.0, 0.0) if is_held else None
 
     def _find_runaway(
-        self, t_s: float, moved: MotionSum, commanded: SetPointSpan, samples: Sequence[WheelSample], limit: float
+        self, t_s: float, moved: MotionSum, commanded: SetPointSpan, samples: Sequence[WheelSample], limit_m_s: float
     ) -> None:
         over_s, right_m, left_m, _ = moved
         _, right_low, right_high, left_low, left_high = commanded
         above = _excess(right_m / over_s, right_low, right_high), _excess(left_m / over_s, left_low, left_high)
-        worst = max(above)
-        if worst <= limit:
+        worst_m_s = max(above)
+        if worst_m_s <= limit_m_s:
             return
-        k = above.index(worst)
+        k = above.index(worst_m_s)
         side = _SIDES[k]
         if broken := _what_is_broken(samples, k):
-            self.alarm.see(t_s, self._broken(side, worst, limit, broken))
+            self.alarm.see(t_s, self._broken(side, worst_m_s, limit_m_s, broken))
         else:
-            self.alarm.see(t_s, conditions.WHEEL_RUNS_AWAY.found(f"{side}_wheel", worst, limit, side=side))
+            self.alarm.see(t_s, conditions.WHEEL_RUNS_AWAY.found(f"{side}_wheel", worst_m_s, limit_m_s, side=side))
 
     @staticmethod
-    def _broken(side: str, value: float, limit: float, what: str) -> MonitorFinding:
-        return conditions.ENCODER_BROKEN.found(f"encoder_{side}", value, limit, side=side, what=what)
+    def _broken(side: str, speed_m_s: float, limit_m_s: float, what: str) -> MonitorFinding:
+        return conditions.ENCODER_BROKEN.found(f"encoder_{side}", speed_m_s, limit_m_s, side=side, what=what)
 
     def _find_stall(self, t_s: float, moved: MotionSum) -> None:
         commanded, cfg = self._stall, self._cfg
         if commanded is None or (self._held_s is not None and t_s - self._held_s < cfg.stall_time_s + _LATENCY_S):
             return
         over_s, right_m, left_m, turned_rad = moved
-        speeds, limit = (abs(right_m) / over_s, abs(left_m) / over_s), cfg.stall_speed_m_s
-        still = [k for k in range(2) if speeds[k] < limit and self._is_commanded(*commanded.of(k))]
+        speeds_m_s, limit_m_s = (abs(right_m) / over_s, abs(left_m) / over_s), cfg.stall_speed_m_s
+        still = [k for k in range(2) if speeds_m_s[k] < limit_m_s and self._is_commanded(*commanded.of(k))]
         if not still:
             return
         disagreement = abs((right_m - left_m) / self._base_m - turned_rad)
-        speed, side = min(speeds[k] for k in still), _SIDES[still[0]]
+        speed_m_s, side = min(speeds_m_s[k] for k in still), _SIDES[still[0]]
         if len(still) == len(_SIDES):
-            finding = conditions.WHEELS_STAND.found("encoders", speed, limit)
+            finding = conditions.WHEELS_STAND.found("encoders", speed_m_s, limit_m_s)
         elif disagreement > _SAME_TURN_RAD:
-            finding = conditions.ENCODER_COUNTS_NOTHING.found(f"encoder_{side}", speed, limit, side=side)
+            finding = conditions.ENCODER_COUNTS_NOTHING.found(f"encoder_{side}", speed_m_s, limit_m_s, side=side)
         else:
-            finding = conditions.WHEEL_BLOCKED.found(f"{side}_wheel", speed, limit, side=side)
+            finding = conditions.WHEEL_BLOCKED.found(f"{side}_wheel", speed_m_s, limit_m_s, side=side)
         self.alarm.see(t_s, finding)
 
     def _is_commanded(self, low: float, high: float) -> bool:
@@ -252,10 +252,10 @@ class WheelMonitor(Monitor):
         """Compare the turns of gyroscope, while plausible, and wheels; ``factor`` multiplies the limit."""
         cfg, (_, right_m, left_m, by_gyroscope) = self._cfg, moved
         by_wheels = (right_m - left_m) / self._base_m
-        difference = by_gyroscope - by_wheels
-        limit = factor * (cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope)))
-        if not -limit <= difference <= limit:
-            self.yaw.see(t_s, conditions.YAW_DISAGREES.found("imu_wz", difference, limit))
+        difference_rad = by_gyroscope - by_wheels
+        limit_rad = factor * (cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope)))
+        if not -limit_rad <= difference_rad <= limit_rad:
+            self.yaw.see(t_s, conditions.YAW_DISAGREES.found("imu_wz", difference_rad, limit_rad))
 
 
 def _what_is_broken(samples: Sequence[WheelSample], side: int) -> str:

@@ -1,12 +1,15 @@
 """What the table of conditions tells an operator stands on its own."""
 
+import ast
 import re
 from math import inf
+from pathlib import Path
 
 import pytest
 from msgspec.json import decode, encode
 from msgspec.structs import replace
 
+from ccatp import conditions
 from ccatp.conditions import Condition, all_conditions, text_of
 from ccatp.conditions.danger import FAN_WEAK, NO_ESTIMATE
 from ccatp.conditions.mission import MEASUREMENTS_FAILED
@@ -42,3 +45,52 @@ def test_values_travel_as_numbers_or_text() -> None:
     cause = MEASUREMENTS_FAILED.cause(count=3, why=ValueError("no fix"), share=inf)
     assert cause.values == {"count": 3, "why": "no fix", "share": "inf"}
     assert decode(encode(cause), type=Cause) == cause
+
+
+UNITS = {"_m_s": "m/s", "_rad_s": "rad/s", "_hz": "Hz", "_m": "m", "_rad": "rad", "_s": "s"}
+PACKAGE = Path(conditions.__file__).parents[1]
+NAMED = (ast.Name, ast.Attribute)
+ROWS = {row.name.upper(): row for row in all_conditions()}
+
+
+def unit_of(value: ast.expr) -> str | None:
+    """The unit in the name of a value, or None."""
+    name = value.id if isinstance(value, ast.Name) else value.attr if isinstance(value, ast.Attribute) else ""
+    return next((unit for suffix, unit in UNITS.items() if name.endswith(suffix)), None)
+
+
+def rows_found() -> list[tuple[str, str, set[str]]]:
+    """Where each row is found: file and line, name of the row, and the units in the names of value and limit."""
+    seen: list[tuple[str, str, set[str]]] = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        functions = [one for one in ast.walk(tree) if isinstance(one, ast.FunctionDef)]
+        for function in functions:
+            chosen: dict[str, list[str]] = {}  # rows of a variable that is one of several
+            for one in ast.walk(function):
+                if isinstance(one, ast.Assign) and isinstance(target := one.targets[0], ast.Name):
+                    chosen[target.id] = [name for name in names_in(one.value) if name in ROWS]
+            for call in ast.walk(function):
+                if not isinstance(call, ast.Call) or len(call.args) < 3:
+                    continue
+                if isinstance(call.func, ast.Attribute) and call.func.attr == "found":
+                    row, values = names_in(call.func.value), call.args[1:3]
+                elif isinstance(call.func, ast.Name) and call.func.id == "FoundEdge":
+                    row, values = names_in(call.args[0]), call.args[1:3]
+                else:
+                    continue
+                units = {unit for value in values if (unit := unit_of(value)) is not None}
+                for name in row:
+                    seen += [(f"{path.name}:{call.lineno}", one, units) for one in chosen.get(name, [name])]
+    return [one for one in seen if one[1] in ROWS]
+
+
+def names_in(value: ast.expr) -> list[str]:
+    return [one.attr if isinstance(one, ast.Attribute) else one.id for one in ast.walk(value) if isinstance(one, NAMED)]
+
+
+def test_the_unit_of_a_row_is_that_of_the_values_it_is_found_with() -> None:
+    found = rows_found()
+    wrong = [(where, name) for where, name, units in found if units - {ROWS[name].unit}]
+    assert wrong == []
+    assert sum(bool(units) for _, _, units in found) > 25
