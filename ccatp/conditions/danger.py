@@ -142,7 +142,8 @@ SAMPLES_MISDATED = inform("samples_misdated", Owner.DANGER, 230, Group.LINK,
     "samples of the {sensor} are {side} their frame: not used",
     "A sample is later than its frame by more than 1 ms, or older by more than 1 s, so its time is not known. What is "
     "not used is missing: see the alarms about samples that are stale.",
-    "Check how the firmware stamps its samples. After a stall of the robot's computer nothing, unless it repeats.", unit="s")
+    "Check how the firmware stamps its samples. After a stall of the robot's computer nothing, unless it repeats.",
+    unit="s")
 FRAMES_LOST = hold("frames_lost", Owner.DANGER, 240, Group.DATA, "frames were lost while the robot may have moved",
     "A gap in the frames while the robot moved. The robot takes a fix.", "If it repeats, check the network.", unit="s",
     then="check the network")

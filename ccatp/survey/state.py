@@ -16,11 +16,8 @@ from ccatp.survey.planning.route import Route
 from ccatp.survey.route_follower import Leg
 
 
-class Travel(Phase, frozen=True, tag=True):
-    """Drives a leg: to the next stop, or a short one that shows the heading of a robot that was lost.
-
-    ``leg``: ``None`` until it is planned.
-    """
+class OnLeg(Phase, frozen=True, tag=True):
+    """Drives a leg; ``leg``: ``None`` until it is planned."""
 
     leg: Leg | None = None
 
@@ -33,6 +30,14 @@ class Travel(Phase, frozen=True, tag=True):
         return DRIVING if tracked is not None and tracked.phase is LegPhase.DRIVE else TURNING
 
 
+class Travel(OnLeg, frozen=True, tag=True):
+    """Drives to the next stop."""
+
+
+class ShowHeading(OnLeg, frozen=True, tag=True):
+    """Drives a short leg, with a fix at each end, that shows the heading of a robot that was lost."""
+
+
 class Returning(Phase, frozen=True, tag=True):
     """Drives home; ``way``: ``None`` until it is planned."""
 
@@ -41,7 +46,7 @@ class Returning(Phase, frozen=True, tag=True):
     kind, shown = Kind.HOME, RETURNING
 
 
-SurveyPhase = Ready | Travel | Settling | Measuring | Retreat | Returning | Held | Paused | Faulted | Over
+SurveyPhase = Ready | Travel | ShowHeading | Settling | Measuring | Retreat | Returning | Held | Paused | Faulted | Over
 
 
 class Located(msgspec.Struct, frozen=True, tag=True):
@@ -124,7 +129,7 @@ class SurveyState(Engagement, frozen=True, kw_only=True, omit_defaults=True, for
         phase = self.phase
         if isinstance(phase, Returning) and phase.way is not None:
             return phase.way.stops
-        if isinstance(phase, Travel) and phase.leg is not None and self.needs_fix:
+        if isinstance(phase, ShowHeading) and phase.leg is not None:
             return (phase.leg.stop,)
         return self.route.stops
 
@@ -142,7 +147,7 @@ class SurveyState(Engagement, frozen=True, kw_only=True, omit_defaults=True, for
     @property
     def purpose(self) -> Purpose:
         """The purpose for the drive gate. After an abort, legs that show the heading belong to the way home."""
-        if self.abort_cause and isinstance(self.phase, Travel) and self.needs_fix:
+        if self.abort_cause and isinstance(self.phase, ShowHeading):
             return Purpose.HOMEWARD
         return PURPOSES[self.mode]
 

@@ -47,8 +47,10 @@ from ccatp.survey.state import (
     Lost,
     Missed,
     OffRoute,
+    OnLeg,
     OnRoute,
     Returning,
+    ShowHeading,
     SurveyPhase,
     SurveyState,
     Travel,
@@ -126,24 +128,29 @@ class Survey(EngagementRules[SurveyState]):
             is_at_edge = verdict is not None and verdict.code is EventCode.NEAR_EDGE
             s = replace(s, pose=Located(motion.t_s + _NOTICED_S) if is_at_edge else Located())
         s = self.react(s, motion, verdict)
-        command = HOLD_POSITION  # also of a mission that is ready, held, paused or over
-        if motion.t_s >= s.stands_until_s:
-            match s.phase:
-                case Travel():
-                    s, command = self._travel(s, motion)
-                case Measuring() as measuring:
-                    s, command = self._measure(s, measuring, motion)
-                case Settling() as settling:
-                    s, command = self._settle(s, settling, motion)
-                case Returning(way):
-                    s, command = self._return(s, way, motion)
-                case Retreat() as retreat if verdict is not None:
-                    s, command = self._back_off(s, retreat, motion, verdict)
+        # Also a mission that is ready, held, paused or over stands.
+        s, command = self._act(s, motion, verdict) if motion.t_s >= s.stands_until_s else (s, HOLD_POSITION)
         if command.twist is not STILL and not any(s.permits(verdict)):
             command = replace(command, twist=STILL)
         if s.inflates_covariance:
             s, command = replace(s, inflates_covariance=False), replace(command, inflates_covariance=True)
         return s, command
+
+    def _act(self, s: SurveyState, motion: StateEstimate, verdict: Verdict | None) -> Step:
+        match s.phase:
+            case Travel():
+                return self._travel(s, motion)
+            case ShowHeading():
+                return self._show_heading(s, motion)
+            case Measuring() as measuring:
+                return self._measure(s, measuring, motion)
+            case Settling() as settling:
+                return self._settle(s, settling, motion)
+            case Returning(way):
+                return self._return(s, way, motion)
+            case Retreat() as retreat if verdict is not None:
+                return self._back_off(s, retreat, motion, verdict)
+        return s, HOLD_POSITION
 
     # -- transitions --------------------------------------------------------------------------------------------------
 
@@ -181,7 +188,7 @@ class Survey(EngagementRules[SurveyState]):
     def change_speed(self, s: SurveyState, *, is_slow: bool) -> SurveyState:
         """Reduce the speed now, or return to the usual speed with the next leg."""
         s = replace(s, is_slow=is_slow)
-        if is_slow and isinstance(s.phase, Travel) and not s.needs_fix:
+        if is_slow and isinstance(s.phase, Travel):
             return replace(s, phase=Travel())
         if is_slow and isinstance(s.phase, Returning) and s.phase.way is not None:
             return replace(s, phase=Returning(s.phase.way.interrupted()))
@@ -212,7 +219,7 @@ class Survey(EngagementRules[SurveyState]):
         if motion.gap_s > 0.0 and self._is_unsupported(s, motion):
             return self._find(s), HOLD_POSITION
         if s.needs_fix:
-            return self._show_heading(s, motion)
+            return enter(s, Event.GO_ON, Settling()), HOLD_POSITION
         if s.budget.is_review_due:
             s, goes_on = self._review_time(s, motion)
             if not goes_on:
@@ -269,7 +276,7 @@ class Survey(EngagementRules[SurveyState]):
             return s, None
         if leg.motion.phase is LegPhase.DRIVE and self._is_vague(before, motion):
             return self._arrive(replace(s, pose=Unconfirmed()), motion)
-        return replace(s, phase=Travel(leg)), MissionCommand(twist)
+        return _on_leg(s, leg), MissionCommand(twist)
 
     def _is_vague(self, leg: Leg | None, motion: StateEstimate) -> bool:
         """Whether the turn of a leg, now over, needs a fix before the robot drives.
@@ -292,7 +299,8 @@ class Survey(EngagementRules[SurveyState]):
         return self._settle(replace(s, phase=settling), settling, motion)
 
     def _show_heading(self, s: SurveyState, motion: StateEstimate) -> Step:
-        """A short leg, with a fix at each end, shows the heading."""
+        if motion.gap_s > 0.0 and self._is_unsupported(s, motion):
+            return self._find(s), HOLD_POSITION
         leg = _leg_of(s.phase)
         if leg is None:
             deck = self.follower.deck_pose(motion)
@@ -302,7 +310,7 @@ class Survey(EngagementRules[SurveyState]):
             if stop is None:
                 return self._arrive(replace(s, pose=pose), motion)
             leg = Leg(stop)
-            s = replace(s, pose=pose, was_reverse=stop.reverse, phase=Travel(leg))
+            s = replace(s, pose=pose, was_reverse=stop.reverse, phase=ShowHeading(leg))
         s, command = self._follow(s, motion, leg.stop)
         return self._arrive(s, motion) if command is None else (s, command)
 
@@ -482,7 +490,7 @@ class Survey(EngagementRules[SurveyState]):
         # The heading has to be certain before the robot drives on.
         is_certain = event.heading_sigma_rad <= self.cfg.mission.heading_doubt_rad
         if isinstance(s.pose, Lost) and s.pose.legs_left > 0 and not is_certain:
-            return enter(s, Event.GO_ON, Travel()) if s.is_awaiting_fix else s
+            return enter(s, Event.GO_ON, ShowHeading()) if s.is_awaiting_fix else s
         # After relocalizing, the robot is not on the route. After a confirmation it is.
         kept = s.course if isinstance(s.course, Corrected) else OnRoute()
         goes_on, s = s.is_awaiting_fix, replace(s, pose=Found(), course=OffRoute() if s.is_lost else kept)
@@ -516,7 +524,8 @@ class Survey(EngagementRules[SurveyState]):
     def _doubt_heading(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:
         """Determine the heading before the robot drives on, if a fix leaves it too uncertain."""
         if heading_sigma_rad > _LOST * self.cfg.mission.heading_doubt_rad and not isinstance(s.pose, Unconfirmed):
-            return replace(s, pose=Lost(MOST_LEGS))
+            phase = ShowHeading() if isinstance(s.phase, Travel) else s.phase
+            return replace(s, pose=Lost(MOST_LEGS), phase=phase)
         return s
 
     def _leave_stop(
@@ -535,7 +544,7 @@ class Survey(EngagementRules[SurveyState]):
                 s = replace(s, skipped=(*s.skipped, point))
             if not is_here:
                 s = replace(s, course=OffRoute())  # the planned route leads to the point again
-            elif isinstance(s.phase, Travel) and not s.needs_fix:
+            elif isinstance(s.phase, Travel):
                 s = replace(s, stop_index=s.stop_index + 1, phase=Travel())
             else:
                 s = replace(s, stop_index=s.stop_index + 1)
@@ -546,7 +555,11 @@ class Survey(EngagementRules[SurveyState]):
 
 
 def _leg_of(phase: SurveyPhase) -> Leg | None:
-    return phase.leg if isinstance(phase, Travel) else None
+    return phase.leg if isinstance(phase, OnLeg) else None
+
+
+def _on_leg(s: SurveyState, leg: Leg) -> SurveyState:
+    return replace(s, phase=replace(s.phase, leg=leg)) if isinstance(s.phase, OnLeg) else s
 
 
 def _without(points: tuple[PointId, ...], point: PointId) -> tuple[PointId, ...]:
