@@ -109,7 +109,7 @@ class SurveyState(Engagement, frozen=True, kw_only=True, omit_defaults=True, for
     request: int = 0  # number of the last requested measurement
     corrections: int = 0
     failures: int = 0  # failed measurements in a row
-    backoffs: int = 0  # on the way to the present stop
+    backoffs: int = 0  # since the last point was left
     budget: BudgetProgress = BudgetProgress()
 
     @property

@@ -15,6 +15,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ccatp.commissioning.conformance.runner import check_ids
+from ccatp.conditions import find_condition
+from ccatp.core import Severity as Level
 from ccatp.studies.bench import machine
 
 PATH = Path(__file__).with_name("table.toml")
@@ -35,6 +37,7 @@ class Row(BaseModel):
     reaction: Text
     bound: Text
     severity: Severity
+    alarms: tuple[str, ...] = Field(default=(), strict=False)
     at_most: dict[str, float] = {}
     at_least: dict[str, float] = {}
     without_realtime: dict[str, float] = {}
@@ -48,6 +51,10 @@ class Row(BaseModel):
             raise ValueError("hardware and conformance belong together")
         if unknown := set(self.conformance) - set(check_ids()):
             raise ValueError(f"ccatp conformance has no check {sorted(unknown)}")
+        if unknown := [name for name in self.alarms if find_condition(name) is None]:
+            raise ValueError(f"there is no condition {unknown}")
+        if self.alarms and self.severity not in (found := severities(self.alarms)):
+            raise ValueError(f"severity is {self.severity}, its alarms have {sorted(found)}")
         if set(self.at_most) & set(self.at_least):
             raise ValueError("a unit is in at_most and in at_least")
         if unknown := set(self.without_realtime) - set(self.at_most):
@@ -70,6 +77,13 @@ class Row(BaseModel):
         """Whether a measurement keeps its limit; what is no number does not."""
         how, limit = self.limit(unit, is_realtime=is_realtime)
         return value >= limit if how == "at least" else value <= limit
+
+
+def severities(alarms: Iterable[str]) -> set[str]:
+    """Severities of conditions when they are found, and those to which they rise."""
+    rows = [row for name in alarms if (row := find_condition(name)) is not None]
+    found = {row.alarm_severity for row in rows} | {row.raised_severity for row in rows}
+    return {one.name.lower() for one in found if one is not Level.NONE}
 
 
 Table = Mapping[str, Row]
@@ -174,7 +188,8 @@ This table lists possible faults, how each is detected, the reaction, and the bo
 page. `ccatp conformance HOST:PORT` checks on any robot the rows about the robot itself.
 """
 COLUMNS = (
-    "| | fault | shows by | reaction | severity | bound | measured | shown by |\n|---|---|---|---|---|---|---|---|"
+    "| | fault | shows by | reaction | severity: [alarms](alarms.md) | bound | measured | shown by |\n"
+    "|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -208,7 +223,8 @@ def _line(row_id: str, row: Row, kept: Record, earlier: list[str]) -> str:
     shown = {name: entry for name, entry in kept.items() if row_id in entry["rows"]}
     bound = row.bound if row.hardware is None else f"{row.bound}. Robot: {row.hardware} ({_listed(row.conformance)})"
     measured, by = (_measured(row_id, row, shown), _files(shown)) if shown else earlier
-    cells = [row_id, row.fault, row.detection, row.reaction, row.severity, bound, measured, by]
+    severity = f"{row.severity}: {_listed(row.alarms)}" if row.alarms else row.severity
+    cells = [row_id, row.fault, row.detection, row.reaction, severity, bound, measured, by]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.faults.linking import judge
-from tests.faults.table import PATH, ROWS, Seen, keep_record, load_record, load_table, machine_line, page
+from tests.faults.table import PATH, ROWS, Row, Seen, keep_record, load_record, load_table, machine_line, page
 
 ROOT = PATH.parents[2]
 TABLE = """
@@ -247,3 +247,13 @@ def test_without_a_record_the_rows_are_there(tmp_path: Path) -> None:
     text = page(load_table(), load_record(tmp_path / "none.json"))
     assert "none of which has run here" in text
     assert not line_of("S1", text)[7]
+
+
+def test_the_severity_of_a_row_is_one_that_its_alarms_have() -> None:
+    row = {"fault": "abc", "detection": "abc", "reaction": "abc", "bound": "abc"}
+    for severity in ("hold", "fault"):  # found as a hold, which becomes a fault
+        assert Row.model_validate({**row, "severity": severity, "alarms": ["wheel_blocked"]}).severity == severity
+    with pytest.raises(ValueError, match=r"severity is return, its alarms have \['fault', 'hold'\]"):
+        Row.model_validate({**row, "severity": "return", "alarms": ["wheel_blocked"]})
+    with pytest.raises(ValueError, match=r"there is no condition \['wheel_bloked'\]"):
+        Row.model_validate({**row, "severity": "hold", "alarms": ["wheel_bloked"]})

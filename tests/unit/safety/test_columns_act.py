@@ -40,6 +40,12 @@ from tests.unit.test_danger import Story as EdgeStory
 FREE = Verdict.normal(0, 0.0)
 LIMITS = {"health.pause_limit_s": 3.0, "health.hold_limit_s": 7.0, "health.lifted_limit_s": 5.0}
 HEALTH = config_of("fyst-m2", **{name.replace(".", "__"): value for name, value in LIMITS.items()}).health
+
+
+def limit_s(row: Condition) -> float:
+    return float(getattr(HEALTH, row.limit.removeprefix("health.")))
+
+
 FOUND = [row for row in DANGER if row.severity and row.group != BEACONS]  # by a monitor
 
 
@@ -118,7 +124,7 @@ def test_limit_is_when_the_severity_rises(row: Condition) -> None:
 
 @named(LASTING)
 def test_escalates_to_is_what_it_becomes(row: Condition) -> None:
-    at_s = LIMITS[row.limit]
+    at_s = limit_s(row)
     assert escalated(row, at_s).severity is row.raised_severity
     assert escalated(replace(row, escalates_to=Action.RETURN), at_s).severity is Severity.RETURN
     assert escalated(replace(row, escalates_to=None), 1e3).severity is row.severity
@@ -159,7 +165,7 @@ def test_clear_is_what_ends_the_hold(row: Condition, monkeypatch: pytest.MonkeyP
 
 @named([row for row in FOUND if Action.LOCATE in (row.action, row.escalates_to)])
 def test_a_fault_of_one_edge_sensor_is_looked_at_with_a_fix(row: Condition, monkeypatch: pytest.MonkeyPatch) -> None:
-    verdict = verdict_of(row) if row.action is Action.LOCATE else escalated(row, LIMITS[row.limit])
+    verdict = verdict_of(row) if row.action is Action.LOCATE else escalated(row, limit_s(row))
     assert verdict.severity is Severity.HOLD
     config, mirror = config_of("fyst-m2"), mirror_of("fyst-m2")
     assert reacted(config, mirror, verdict).located

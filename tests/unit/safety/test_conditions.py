@@ -34,6 +34,7 @@ from tests.support.scenario import config_of, mirror_of
 FRAME_S, SAMPLE_S = 0.01, 0.001
 BEGIN_S = 3.0  # until then the robot is sound: rates, noise and set points are learned
 LIMIT_S = 6.0  # instead of the configured ``hold_limit_s``
+HEALTH = config_of("fyst-m2", health__hold_limit_s=LIMIT_S).health
 
 
 @dataclass
@@ -280,9 +281,10 @@ def test_it_is_found_lasts_and_is_over(row: Row) -> None:
 
 def times_s(condition: Condition) -> Any:
     """When the condition becomes graver, after its signal was found first."""
-    times = {Severity.HOLD: 2.0} if condition.severity is Severity.PAUSE else {}
+    times: dict[Severity, float] = {}
     if condition.escalates_to is not None:
-        times[Severity.FAULT] = 3.0 if condition is rows.LIFTED else LIMIT_S
+        times[Severity.FAULT] = LIMIT_S  # also of what became a hold
+        times[condition.raised_severity] = getattr(HEALTH, condition.limit.removeprefix("health."))
     return pytest.approx(times, abs=0.025)  # two frames: the monitors look at every second one
 
 
