@@ -31,7 +31,7 @@ from ccatp.filters.base import (
 
 
 class KalmanFilter:
-    """The Kalman filter of thesis eq. 2.13.
+    """The Kalman filter of thesis eq. 2.13, which lists eqs 2.5 to 2.10 again.
 
     ::
 
@@ -94,7 +94,7 @@ class KalmanFilter:
         check_transition(ahead, F, Q, self._states)
         x = dgemv(1.0, F, self._x) if ahead is None else ahead.copy()  # 2.5
         FL = dgemm(1.0, F, self._L)
-        self._accept_prediction(x, dgemm(1.0, FL, FL, 1.0, Q, 0, 1), F.copy())  # 2.6: F L (F L)^T + Q
+        self._accept_prediction(x, dgemm(1.0, FL, FL, beta=1.0, c=Q, trans_b=True), F.copy())  # 2.6: F L (F L)^T + Q
 
     def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> Innovation:
         """Condition on z (m,) = H x + noise, thesis eqs 2.7 to 2.10; see ``Filter.update``."""
@@ -102,7 +102,7 @@ class KalmanFilter:
         check_rows(z, expected, H, R, self._states)
         if z.size == 0:
             return Innovation(z, 0.0)
-        nu = dgemv(-1.0, H, self._x, 1.0, z) if expected is None else z - expected  # 2.7
+        nu = dgemv(-1.0, H, self._x, beta=1.0, y=z) if expected is None else z - expected  # 2.7
         return self._condition(nu, dgemm(1.0, H, self._L), self._L, R)
 
     def _accept_prediction(self, x: FloatArray, P: FloatArray, F: FloatArray) -> None:
@@ -117,13 +117,13 @@ class KalmanFilter:
         """Eqs 2.8 to 2.10 with P = L L^T, L (n, k), and H L (m, k)."""
         m, (n, k) = nu.size, L.shape
         # In the other order, N before H L, the errors are larger (docs/mathematics.md).
-        reflections, tau, _, _ = dgeqrf(beside_noise_root(HL, R).T, 3 * m, 1)
+        reflections, tau, _, _ = dgeqrf(beside_noise_root(HL, R).T, lwork=3 * m, overwrite_a=True)
         wide = np.zeros((n, k + m), order="F")
         wide[:, :k] = L
-        wide, _, _ = dormqr("R", "N", reflections, tau, wide, n, 1)
+        wide, _, _ = dormqr("R", "N", reflections, tau, wide, lwork=n, overwrite_c=True)  # times Theta
         V, L = wide[:, :m], wide[:, m:]  # 2.8, 2.10
-        y = dtrsv(reflections[:m], nu, 1, 0, 0, 1)  # C^T is the upper triangle
-        x = dgemv(1.0, V, y, 1.0, self._x)  # 2.9
+        y = dtrsv(reflections[:m], nu, trans=True)  # C^-1 nu; C^T is the upper triangle
+        x = dgemv(1.0, V, y, beta=1.0, y=self._x)  # 2.9
         nis = ddot(y, y)
         if not ddot(x, x) + nis < HUGE:
             raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {nu.tolist()}")

@@ -14,6 +14,7 @@ from ccatp.conditions import (
     find_condition,
 )
 from ccatp.conditions.danger import EARTHQUAKE
+from ccatp.conditions.mission import STUCK_AT_EDGE
 from ccatp.core import Severity, Verdict
 from ccatp.survey.engagement import (
     ABORTED,
@@ -162,7 +163,7 @@ def _wait_at_edge(rules: EngagementRules[S], s: S, frame: Any, v: Verdict) -> tu
     if v.code is not NEAR_EDGE and v is not NO_FRESH_VERDICT:
         return replace(s, phase=replace(held, stuck_s=None)), False
     if frame.t_s - held.stuck_s > rules.stuck_limit_s:
-        return rules.fault(s, s.cause), True
+        return rules.fault(s, STUCK_AT_EDGE.cause()), True
     return s, True
 
 

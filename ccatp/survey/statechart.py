@@ -167,7 +167,7 @@ class Survey(EngagementRules[SurveyState]):
             course=OffRoute() if s.is_held else s.course,
         )
         if s.needs_fix:
-            return enter(s, Event.GO_ON, Measuring() if isinstance(s.phase, Measuring) else Settling())
+            return enter(s, Event.GO_ON, Settling())
         if s.abort_cause:
             # The way home is planned again from where the robot is now.
             return enter(replace(s, cause=s.abort_cause), Event.GO_HOME, Returning())

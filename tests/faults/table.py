@@ -51,8 +51,8 @@ class Row(BaseModel):
             raise ValueError("hardware and conformance belong together")
         if unknown := set(self.conformance) - set(check_ids()):
             raise ValueError(f"ccatp conformance has no check {sorted(unknown)}")
-        if unknown := [name for name in self.alarms if find_condition(name) is None]:
-            raise ValueError(f"there is no condition {unknown}")
+        if unnamed := [name for name in self.alarms if find_condition(name) is None]:
+            raise ValueError(f"there is no condition {unnamed}")
         if self.alarms and self.severity not in (found := severities(self.alarms)):
             raise ValueError(f"severity is {self.severity}, its alarms have {sorted(found)}")
         if set(self.at_most) & set(self.at_least):

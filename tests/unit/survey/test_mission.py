@@ -7,11 +7,12 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.conditions import text_of
-from ccatp.conditions.danger import EDGE_SENSOR_STAYS_OFF, ESTIMATE_NOT_FINITE, RIM_AHEAD
+from ccatp.conditions.danger import EDGE_SENSOR_STAYS_OFF, ENCODERS_STALE, ESTIMATE_NOT_FINITE, RIM_AHEAD
+from ccatp.conditions.mission import NO_REST, STUCK_AT_EDGE
 from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, PointId, Predicted, Severity, Stop, StopKind, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.behaviours import MissionCommand
+from ccatp.survey.behaviours import SETTLE_LIMIT_S, MissionCommand
 from ccatp.survey.events import (
     Abort,
     EstimateDiverged,
@@ -30,7 +31,7 @@ from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import Route
 from ccatp.survey.route_follower import LegFollower, StateEstimate
 from ccatp.survey.statechart import Mission, Survey
-from tests.support.mission_story import ABORT, FREE, FRONT_OFF, Story, from_first_leg
+from tests.support.mission_story import ABORT, DT, FREE, FRONT_OFF, Story, from_first_leg
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +121,42 @@ def test_an_edge_that_does_not_clear_faults(story: Story) -> None:
     assert not story.state.is_faulted  # it may have been a flash of light
     story.until(lambda: story.state.is_faulted, FRONT_OFF, frames=3100)
     assert "stuck at the edge" in text_of(story.state.cause)
+
+
+def test_an_edge_that_does_not_clear_faults_by_its_own_cause(story: Story) -> None:
+    story.drive_on()
+    story.until_state(Mode.HELD, FRONT_OFF)
+    story.frame(replace(FRONT_OFF, severity=Severity.HOLD, cause=ENCODERS_STALE.cause(), reverse=False))
+    assert story.state.cause == ENCODERS_STALE.cause()
+    story.until(lambda: story.state.is_faulted, FRONT_OFF, frames=3100)
+    assert story.state.cause == STUCK_AT_EDGE.cause()
+
+
+def test_a_pose_lost_while_it_measures_leaves_the_deadline_of_rest(story: Story) -> None:
+    story.auto_fix = False
+    story.until_state(Mode.MEASURING)
+    point = story.state.measuring_point
+    story.until(lambda: story.orders[-1].measure)
+    story.mission.handle(FixStored(point, heading_sigma_rad=1.0))
+    assert story.state.is_lost
+    story.omega = 0.2
+    for _ in range(round(SETTLE_LIMIT_S / DT) + 5):
+        story.frame()
+        story.omega = 0.2  # it does not come to rest
+    assert story.state.cause.condition == NO_REST.name
+    assert story.state.is_faulted
+
+
+def test_no_leg_of_the_route_is_driven_with_a_heading_in_doubt(story: Story) -> None:
+    """A fix that is stored late, on the way to another point, leaves the heading in doubt."""
+    story.drive_on()
+    leg = story.state.stops[story.state.stop_index]
+    story.mission.handle(FixStored(PointId(5, 5, 3), heading_sigma_rad=1.0))
+    assert story.state.is_lost
+    story.until(lambda: story.state.stops != story.stops)
+    (short,) = story.state.stops
+    assert short.point is None
+    assert short != leg
 
 
 def found_at_the_edge(story: Story) -> None:
