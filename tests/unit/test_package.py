@@ -74,7 +74,7 @@ def test_a_message_is_one_line_and_that_of_the_first_problem() -> None:
         ("estimate_stale", "estimate stale", "estimate", 0.31, 0.15, "estimate stale: 0.31 s (limit 0.15 s)"),
         ("edge_stale", "edge samples stale", "edge", 0.2, 0.1, "edge samples stale: 0.2 s (limit 0.1 s)"),
         ("all_off", "lifted or fallen", "edge", 4.0, 3.0, "lifted or fallen (edge): 4 (limit 3)"),
-        ("wheel_runs_away", "left wheel fast", "left_wheel", 0.5, 0.1, "left wheel fast: 0.5 (limit 0.1)"),
+        ("wheel_runs_away", "left wheel fast", "left_wheel", 0.5, 0.1, "left wheel fast: 0.5 m/s (limit 0.1 m/s)"),
         ("emergency", "emergency: fire", "emergency:fire", 1.0, 0.0, "emergency: fire"),
         ("", "", "", 0.0, 0.0, ""),
         ("of_another_version", "it burns", "estimate", 2.0, 1.0, "it burns (estimate): 2 (limit 1)"),

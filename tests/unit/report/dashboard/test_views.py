@@ -164,7 +164,7 @@ def test_the_verdict_and_its_cause(view: SurveyView) -> None:
     )  # fmt: skip
     text = "off the panel where the map has no seam"
     more = {"cause": text, "condition": "no_seam", "is_stale": False}
-    more["text"] = f"{text} (front left): 0.006 (limit 0.005)"
+    more["text"] = f"{text} (front left): 0.006 m (limit 0.005 m)"
     assert reported(view, verdict)["verdict"] == json.loads(msgspec.json.encode(verdict)) | more
     assert reported(view, now_s=2.5)["verdict"]["is_stale"]
     event = DangerEvent(
