@@ -317,7 +317,9 @@ class SilRun:
             self._code = verdict.code
             self.trace.builder.add_verdict_event(sensors.seq, verdict.code)
         self.pipeline.estimate(frame)
-        drive = self.pipeline.plan(frame, before, 0.0)  # the decision in a frame goes by the verdict on the one before
+        drive = self.pipeline.decide(
+            frame, before, 0.0
+        )  # the decision in a frame goes by the verdict on the one before
         self.states_s[self.mission.state.mode] += dt_s
         self._publish(frame)
         if self._is_measuring:

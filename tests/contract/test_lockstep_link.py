@@ -105,7 +105,7 @@ class Answering:
     def report_bad_line(self, text: str) -> None:
         """Not what is asked for here."""
 
-    def publish_levels(self) -> None:
+    def on_heartbeat(self) -> None:
         """Nobody listens."""
 
     def is_frame_due(self) -> bool:

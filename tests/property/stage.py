@@ -182,7 +182,7 @@ class Stage(SilRun):
         verdict = self._verdict
         if verdict is not None and not abs(t_s - verdict.t_s) <= FRESH_S:
             verdict = None
-        drive = self.pipeline.plan(timed, verdict, 0.0)
+        drive = self.pipeline.decide(timed, verdict, 0.0)
         self._publish(timed)
         if self._is_measuring:
             self._is_measuring = False

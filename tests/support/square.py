@@ -96,7 +96,7 @@ class Runner(mission_runner.MissionRunner):
     def log_statistics(self) -> None: ...
     def estimate(self, frame: TimedFrame) -> None: ...
 
-    def plan(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
         mission, robot, (x, y, heading) = self.mission, self._cfg.robot, self._pose
         if not all(mission.react(frame, verdict).permits(verdict)):
             return self.hold(frame)

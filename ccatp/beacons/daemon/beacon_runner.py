@@ -157,7 +157,7 @@ class BeaconRunner(MissionRunner):
             self.telemetry.log.warning("bad_extra_keys", seq=frame.sensors.seq, error=str(error))
         self._measurements = self._reader.read(frame.sensors, extras)
 
-    def plan(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
         """The drive for the mission's velocity, as far as the verdict permits it."""
         mission = self.mission
         if self._measurements is None:

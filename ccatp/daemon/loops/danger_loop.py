@@ -85,7 +85,7 @@ class DangerLoop:
     async def close(self) -> None:
         """The process ends."""
 
-    def publish_levels(self) -> None:
+    def on_heartbeat(self) -> None:
         """The verdict is published with each frame."""
 
     def on_joined(self, hello: Hello) -> None:

@@ -51,7 +51,7 @@ class FrameTime(Protocol):
 
     withheld: int | None
 
-    def plan(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
         """The drive that answers a frame; ``verdict``: in force, or ``None``."""
 
     def answer(self, seq: int, drive: DriveCommand) -> None:
@@ -75,9 +75,9 @@ class LockstepTime:
         self._drives = drives
         self.withheld: int | None = None
 
-    def plan(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
         """No frame is late."""
-        return self._runner.plan(frame, verdict, 0.0)
+        return self._runner.decide(frame, verdict, 0.0)
 
     def answer(self, seq: int, drive: DriveCommand) -> None:
         """Send the drive. Only a standing robot waits for its answer."""
@@ -128,7 +128,7 @@ class RealTime:
         self._catches_up_until_s = -inf
         self.frame_period_s = 0.0  # of the present session
 
-    def plan(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
         """The drive that answers a frame; zero if the frame is too late."""
         runner, limits, begun_s = self._runner, self._limits, time.monotonic()
         lag_s = self._lateness.add(frame.sensors.t, begun_s)
@@ -139,7 +139,7 @@ class RealTime:
                 return runner.hold(frame)
             verdict = None
             self._pause(frame.sensors.seq, lag_s, age_s)
-        drive = runner.plan(frame, verdict, lag_s)
+        drive = runner.decide(frame, verdict, lag_s)
         now_s = time.monotonic()
         is_slow, is_still = now_s - begun_s > self.frame_period_s, drive == STILL
         # No hold for the delay of planning: it would cause new planning, and so on without end on a slow machine.

@@ -180,7 +180,7 @@ class MainLoop:
 
     # -- beside the frames ----------------------------------------------------------------------------------------
 
-    def publish_levels(self) -> None:
+    def on_heartbeat(self) -> None:
         self._telemetry.flush(BATCH_WALL_S)
         self._update_alarms()
         if self.heartbeat.phase != "starting":
@@ -309,7 +309,7 @@ class MainLoop:
             if not is_first:  # the first frame of a session has no earlier frame with a verdict
                 verdict = self.peer.latest(seq, self.frame_period_s, is_lockstep=self.session.is_lockstep)
             decided_s = time.perf_counter()
-            self._time.answer(seq, self._time.plan(frame, verdict))
+            self._time.answer(seq, self._time.decide(frame, verdict))
 
             runner.publish(frame)
             self._telemetry.tick_us.append(1e6 * (time.perf_counter() - decided_s + asked_s - begun_s))

@@ -178,7 +178,7 @@ class MissionRunner(ABC):
         """Process the samples; the danger loop judges the same frame meanwhile."""
 
     @abstractmethod
-    def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
         """The drive that answers the frame, served ``lag_s`` late; ``verdict``: in force, or ``None``."""
 
     @abstractmethod

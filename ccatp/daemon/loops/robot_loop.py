@@ -60,8 +60,8 @@ class LoopWork(LockstepAnswers, Protocol):
     def on_lost(self, reason: str) -> None:
         """Handle the loss of the session; the robot holds itself."""
 
-    def publish_levels(self) -> None:
-        """Publish the levels, which are repeated with the heartbeat."""
+    def on_heartbeat(self) -> None:
+        """Publish what is repeated with the heartbeat."""
 
     def report_bad_line(self, text: str) -> None:
         """Report the first bad line of a session to the operator; for each loop it is in the log."""
@@ -134,7 +134,7 @@ class RobotLoop:
         """Publish periodically, until cancelled."""
         while True:
             self.heartbeat.publish()
-            self._work.publish_levels()
+            self._work.on_heartbeat()
             await asyncio.sleep(PERIOD_S)
 
     async def watch(self) -> None:

@@ -91,7 +91,7 @@ class SurveyPipeline:
             frame.t_s, frame.dt_s, pose, v, omega, creep, ahead, *sigmas, turn_creep_m_rad, localizer.gap_s
         )
 
-    def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
         """The drive for the mission's velocity, as far as the gate permits it."""
         mission, motion, sensors = self.mission, self.motion, frame.sensors
         if motion is None:

@@ -207,10 +207,10 @@ class SurveyRunner(MissionRunner):
     def record_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
         self.telemetry.send("treatment", Treatment(seq=sensors.seq, t_s=sensors.t, kind=kind, values=values))
 
-    def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
         if self._mirror_check is not None and not self._is_on_mirror(self._mirror_check, frame.sensors):
             return self.hold(frame)
-        drive = self._pipeline.plan(frame, verdict, lag_s)
+        drive = self._pipeline.decide(frame, verdict, lag_s)
         if self._parts.gate.denial is not None:
             self._gate_log.update(frame.t_s)
         return drive

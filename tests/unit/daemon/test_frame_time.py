@@ -144,11 +144,11 @@ def test_a_late_frame_is_planned_without_a_verdict_and_pauses_the_mission(
     robot = load_config().robot
     planned: list[tuple[object, float]] = []
 
-    def plan(_frame: object, verdict: object, lag_s: float) -> DriveCommand:
+    def decide(_frame: object, verdict: object, lag_s: float) -> DriveCommand:
         planned.append((verdict, lag_s))
         return MOVING
 
-    rig.stand_in.plan = plan
+    rig.stand_in.decide = decide
     logged: list[dict[str, Any]] = []
     rig.stand_in.telemetry.log = SimpleNamespace(warning=lambda _, **fields: logged.append(fields))
     pauses = pause_watch(rig)
@@ -160,7 +160,7 @@ def test_a_late_frame_is_planned_without_a_verdict_and_pauses_the_mission(
     for seq, delay_s in enumerate((0.0, late_s)):
         now_s += 0.01 + delay_s
         sensors = SimpleNamespace(seq=seq, t=0.01 * seq, cmd=echo)
-        real_time.plan(cast(Any, SimpleNamespace(sensors=sensors)), cast(Any, "verdict"))
+        real_time.decide(cast(Any, SimpleNamespace(sensors=sensors)), cast(Any, "verdict"))
     assert [verdict for verdict, _ in planned] == ["verdict", None]
     assert planned[1][1] == pytest.approx(late_s, abs=1.1e-2 * 0.01)  # the drift of the clocks in a frame
     assert [(one["seq"], one["limit_ms"]) for one in logged] == [(1, 1e3 * robot.lag_limit_s)]

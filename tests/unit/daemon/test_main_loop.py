@@ -104,7 +104,7 @@ def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
         for _ in range(5):
             now_s += 0.3 * STANDS_REPORT_S
             loop.heartbeat.frame_s = now_s
-            loop.publish_levels()
+            loop.on_heartbeat()
     assert said == [f"the robot has been stationary for 36 s: {mode}, and nothing is wrong: {waits_for(mode)}"]
     assert waits_for(mode)
 
