@@ -22,7 +22,7 @@ from ccatp.links.topics import ArrivalMessage, MissionStatus
 from ccatp.records.run_reader import RecordedFrame
 from ccatp.records.store import StoredPoint, planned_point
 from ccatp.report.findings import findings_of
-from ccatp.report.record import RecordedSession, SurveyRecord, changed_from_shipped
+from ccatp.report.record import RecordedSession, SurveyFiles, changed_from_shipped
 from ccatp.sim.fault_plan import FaultPlan, read_plan
 from ccatp.studies.sil_run import SilResult, SilRun
 from ccatp.survey.behaviours import MissionCommand
@@ -120,7 +120,7 @@ class _ObservedRun(SilRun):
             changes=(),
         )
         misalignments = self.robot.world.misalignments.items()
-        record = SurveyRecord(
+        record = SurveyFiles(
             name=f"{cfg.mirror.name}-{cfg.world.name}-s{cfg.run.seed}",
             config_text=dump_config(cfg),
             changed=changed_from_shipped(cfg),

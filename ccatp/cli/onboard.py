@@ -12,7 +12,7 @@ from ccatp.cli import common
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
-    from ccatp.onboard.kinds import OnboardRobotConfig, RobotKind
+    from ccatp.onboard.kinds import OnboardCommonConfig, RobotKind
     from ccatp.onboard.tuning import Tuning
 
 CHECK_S = 2.0
@@ -52,7 +52,7 @@ def onboard(
     return _check(kind, cfg, json_output=json_output) if is_check else _run(kind, cfg)
 
 
-def _run(kind: "RobotKind", cfg: "OnboardRobotConfig") -> int:
+def _run(kind: "RobotKind", cfg: "OnboardCommonConfig") -> int:
     import sys
     from functools import partial
 
@@ -86,7 +86,7 @@ def _listen(host: str, port: int) -> socket.socket:
         ) from error
 
 
-def _check(kind: "RobotKind", cfg: "OnboardRobotConfig", *, json_output: bool) -> int:
+def _check(kind: "RobotKind", cfg: "OnboardCommonConfig", *, json_output: bool) -> int:
     boot_s = time.monotonic()
     checks = kind.hardware(cfg, lambda: time.monotonic() - boot_s).check(CHECK_S)
     lines = []

@@ -37,7 +37,7 @@ class RobotHardware(Protocol):
         """Hold the wheels and release the devices."""
 
 
-class OnboardRobotConfig(Protocol):
+class OnboardCommonConfig(Protocol):
     """What the configurations of all kinds have."""
 
     @property
@@ -57,12 +57,12 @@ class RobotKind:
     make_robot: Part  # Callable[[C, RobotHardware], ControlledRobot]
     no_tuning: str = ""
 
-    def hardware(self, cfg: OnboardRobotConfig, clock: Callable[[], float]) -> RobotHardware:
+    def hardware(self, cfg: OnboardCommonConfig, clock: Callable[[], float]) -> RobotHardware:
         """The devices, not opened yet."""
         made: RobotHardware = self.make_hardware.get()(cfg, clock)
         return made
 
-    def robot(self, cfg: OnboardRobotConfig, hardware: RobotHardware) -> ControlledRobot:
+    def robot(self, cfg: OnboardCommonConfig, hardware: RobotHardware) -> ControlledRobot:
         """The robot on started hardware."""
         made: ControlledRobot = self.make_robot.get()(cfg, hardware)
         return made
@@ -88,8 +88,8 @@ def kind_in(file: Path | None, overrides: Overrides = None) -> RobotKind:
     return kind
 
 
-def load_robot_config(file: Path | None, overrides: Overrides = None) -> tuple[RobotKind, OnboardRobotConfig]:
+def load_robot_config(file: Path | None, overrides: Overrides = None) -> tuple[RobotKind, OnboardCommonConfig]:
     """The kind of a configuration, and the configuration. Raises ConfigError."""
     kind = kind_in(file, overrides)
-    cfg: OnboardRobotConfig = kind.load.get()(file, overrides)
+    cfg: OnboardCommonConfig = kind.load.get()(file, overrides)
     return kind, cfg

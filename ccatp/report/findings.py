@@ -22,7 +22,7 @@ from ccatp.mirror.network_points import CalibratedSurveys
 from ccatp.records.summary import arrival_error_m, distribution, measured_error_m
 from ccatp.records.timeline import common_rows, row_before, rows_of
 from ccatp.report.network import remarks
-from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, SurveyRecord
+from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, SurveyFiles
 from ccatp.survey.composition import plan_survey
 from ccatp.survey.ending import ending_of, read_ending, why_text
 from ccatp.survey.fix_gate import nis_of
@@ -65,7 +65,7 @@ class PointVerdict(NamedTuple):
         return f"{'/'.join(map(str, self.point))}: {self.grade}{''.join(known)}"
 
 
-def point_verdicts(record: SurveyRecord) -> list[PointVerdict]:
+def point_verdicts(record: SurveyFiles) -> list[PointVerdict]:
     """Every point of the mission, by row, column and number; empty if the run has no mission."""
     first, reasons = first_arrivals_mm(record), _reasons(record)
     mirror, height_m = record.mirror, record.cfg.robot.puck_height_m
@@ -87,7 +87,7 @@ def point_verdicts(record: SurveyRecord) -> list[PointVerdict]:
     return found
 
 
-def first_arrivals_mm(record: SurveyRecord) -> dict[PointId, float]:
+def first_arrivals_mm(record: SurveyFiles) -> dict[PointId, float]:
     """Distance from each point at the first rest there, mm, by the truth or by the first fix there."""
     found: dict[PointId, float] = {}
     mirror, height_m = record.mirror, record.cfg.robot.puck_height_m
@@ -108,7 +108,7 @@ def first_arrivals_mm(record: SurveyRecord) -> dict[PointId, float]:
     return found
 
 
-def _reasons(record: SurveyRecord) -> dict[PointId, str]:
+def _reasons(record: SurveyFiles) -> dict[PointId, str]:
     status = record.last_status
     by_reason: Mapping[str, list[str]] = {} if status is None else status.left_out
     if not by_reason and record.summary is not None:
@@ -136,7 +136,7 @@ class ErrorSeries(NamedTuple):
     fix_fused: "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]"
 
 
-def error_series(record: SurveyRecord) -> ErrorSeries | None:
+def error_series(record: SurveyFiles) -> ErrorSeries | None:
     """The errors of a run; None without an estimate."""
     sessions = [session for session in record.sessions if len(session.track.seq)]
     if not sessions:
@@ -200,7 +200,7 @@ class Quality(NamedTuple):
     nis: Consistency | None  # of the position of each fix against the estimate before it
 
 
-def quality_of(record: SurveyRecord, alignment: SurveyResult | None) -> Quality:
+def quality_of(record: SurveyFiles, alignment: SurveyResult | None) -> Quality:
     """Residuals, repeatability, NIS. A consistent filter has NIS <= 1, because the recorded sigma is the largest."""
     panels = () if alignment is None else alignment.panels
     chi2, dof = np.array([(panel.model.chi2, panel.model.dof) for panel in panels]).reshape(-1, 2).T
@@ -268,7 +268,7 @@ class TimeBreakdown(NamedTuple):
         return None if self.least_s is None else sum(self.least_s.values())
 
 
-def time_budget(record: SurveyRecord) -> TimeBreakdown | None:
+def time_budget(record: SurveyFiles) -> TimeBreakdown | None:
     """Times of a run; None if its states are not recorded. Measuring beyond the configured time counts as waiting."""
     measuring_s = record.cfg.etalon.measuring_time_s
     found = [spells_of(session) for session in record.sessions]
@@ -320,7 +320,7 @@ def spells_of(session: RecordedSession) -> tuple[list[TimeSpan], bool]:
     return [(state, duration_s) for state, duration_s in spells if duration_s > 0.0 and state != _OVER], is_exact
 
 
-def least_times(record: SurveyRecord) -> tuple[dict[str, float] | None, str]:
+def least_times(record: SurveyFiles) -> tuple[dict[str, float] | None, str]:
     """Least times of the planned way up to the last measured point, and the covered part as text.
 
     These are bang-bang times from rest to rest with a turn in place at every stop (``ccatp.survey.planning.search``).
@@ -351,7 +351,7 @@ def least_times(record: SurveyRecord) -> tuple[dict[str, float] | None, str]:
 class Findings:
     """A run and its results; parts that the run lacks are None or empty."""
 
-    record: SurveyRecord
+    record: SurveyFiles
     outcome: PointOutcome
     points: list[PointVerdict]
     errors: ErrorSeries | None  # over time
@@ -369,7 +369,7 @@ class Findings:
         return (*self.record.warnings, *remarks(self.network), *aligned)
 
 
-def findings_of(record: SurveyRecord) -> Findings:
+def findings_of(record: SurveyFiles) -> Findings:
     """Compute the results of a recorded run."""
     errors, cfg = error_series(record), record.cfg
     alignment = network = against = None
@@ -384,7 +384,7 @@ def findings_of(record: SurveyRecord) -> Findings:
     return Findings(record, outcome, points, errors, figures, budget, alignment, network, against, quality)
 
 
-def observation_of(record: SurveyRecord) -> dict[str, str]:
+def observation_of(record: SurveyFiles) -> dict[str, str]:
     """Time (UTC), place, observer and instruments; unknown values are left out."""
     date = {"date_obs": record.log[0].wall, "date_end": record.log[-1].wall} if record.log else {}
     values = {**date, "mirror": record.mirror.name, **record.cfg.observation.model_dump()}
@@ -426,7 +426,7 @@ def coverage_of(found: Findings) -> dict[str, int]:
 _FINISHED = "run finished: status 0"
 
 
-def outcome_of(record: SurveyRecord) -> PointOutcome:
+def outcome_of(record: SurveyFiles) -> PointOutcome:
     """Outcome of the run by the last status, otherwise by the log; without both it is running or was killed."""
     status = record.last_status
     if status is not None and (status.outcome or status.exit_status >= 0):

@@ -21,7 +21,7 @@ from ccatp.mirror.panel_alignment import PanelResult, adjuster_places, on_grid_m
 from ccatp.report import plots
 from ccatp.report.findings import Grade, PointVerdict, point_verdicts
 from ccatp.report.plots import BAD, INK, PANEL, PAPER, PATH, PX_PER_IN, QUIET, SEAM, PictureError, add_legend, is_wide
-from ccatp.report.record import WITHIN_MM, SurveyRecord, read_record
+from ccatp.report.record import WITHIN_MM, SurveyFiles, read_record
 from ccatp.survey.survey_plan import SurveyPlan
 
 MAP_WIDTH_PX, MAP_DPI = 1600, 160
@@ -138,7 +138,7 @@ def run_map(
     return _finished(axes, scale, label, width_px, extend="max" if largest > top else "neither")
 
 
-def path_figure(record: SurveyRecord, verdicts: Sequence[PointVerdict], width_px: float) -> Figure:
+def path_figure(record: SurveyFiles, verdicts: Sequence[PointVerdict], width_px: float) -> Figure:
     """The map of a report: the path, and the distance of each first arrival."""
     label = "true path" if record.has_truth else "estimated path"
     title = f"{record.mirror.name}: path and arrival errors"
@@ -146,7 +146,7 @@ def path_figure(record: SurveyRecord, verdicts: Sequence[PointVerdict], width_px
     return run_map(record.mirror, path_m, verdicts, width_px, title, path_label=label, is_first=True)
 
 
-def driven_path_m(record: SurveyRecord) -> FloatArray:
+def driven_path_m(record: SurveyFiles) -> FloatArray:
     """True path, or else estimated path; deck x, y in m, shape (k, 2), sessions separated by NaN."""
     pieces: list[FloatArray] = [np.empty((0, 2))]
     for session in record.sessions:
@@ -155,7 +155,7 @@ def driven_path_m(record: SurveyRecord) -> FloatArray:
     return np.concatenate(pieces)
 
 
-def paths_figure(mirror: Mirror, records: Mapping[str, SurveyRecord], width_px: float) -> Figure:
+def paths_figure(mirror: Mirror, records: Mapping[str, SurveyFiles], width_px: float) -> Figure:
     """The mirror with the paths of two runs; the later one is drawn over the earlier one."""
     axes = new_mirror_map(mirror, width_px, f"{mirror.name}: both paths")
     for (name, record), colour, width in zip(records.items(), plots.SERIES, (2.2, 0.8), strict=False):
@@ -179,7 +179,7 @@ def draw_from_run_dir(run_dir: Path, out: Path) -> tuple[str, ...]:
     return record.warnings
 
 
-def record_map(record: SurveyRecord, width_px: float) -> Figure:
+def record_map(record: SurveyFiles, width_px: float) -> Figure:
     """The map of a run with its result in the title."""
     cfg, verdicts = record.cfg, point_verdicts(record)
     errors = [one.left_mm for one in verdicts if one.left_mm is not None]

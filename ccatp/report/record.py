@@ -97,7 +97,7 @@ class RunFiles:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class SurveyRecord(RunFiles):
+class SurveyFiles(RunFiles):
     """A survey."""
 
     cfg: Config
@@ -120,7 +120,7 @@ class SurveyRecord(RunFiles):
         return bool(driven) and all(session.truth is not None for session in driven)
 
 
-def read_record(run_dir: Path) -> SurveyRecord:
+def read_record(run_dir: Path) -> SurveyFiles:
     """Read the data for the report of a survey.
 
     Raises RunReadError: no such directory, no run in it, or no survey; ConfigError: its configuration cannot be used.
@@ -146,7 +146,7 @@ def read_record(run_dir: Path) -> SurveyRecord:
         folder.missing.append("the simulated truth: errors are those that the laser saw")
     points, measured = _survey(folder, mirror)
     injected, _ = read_truth(run_dir, folder.warnings)
-    return SurveyRecord(
+    return SurveyFiles(
         cfg=cfg,
         mirror=mirror,
         sessions=tuple(sessions),

@@ -6,7 +6,13 @@ from pathlib import Path
 import pytest
 
 from tools.metrics.frame_profile import measure, profile
-from tools.metrics.sizes import duplicate_classes, read_sources, single_importer_modules
+from tools.metrics.sizes import (
+    duplicate_classes,
+    largest_classes,
+    moving_sources,
+    read_sources,
+    single_importer_modules,
+)
 
 A = '''"""Docstring."""
 
@@ -43,6 +49,41 @@ def test_lines_names_and_imports_are_counted(tmp_path: Path) -> None:
     assert sum(one.functions for one in sources.values()) == 2
     assert duplicate_classes(sources.values()) == ["Same"]
     assert single_importer_modules(sources.values()) == ["p", "p.b"]  # p.c has two importers, p.a has none
+
+
+LOOP = """from ccatp.a import f
+
+
+class Loop:
+    def __init__(self, cfg):
+        self.one = self.two = cfg
+        self.two, self.three = 1, 2
+        other.four = isinstance(cfg, RobotConfig | models.Config), isinstance(cfg, int)
+
+    def f(self) -> tuple[int, int, int]: ...
+
+    def g(self) -> tuple[int, int]: ...
+
+    def h(self) -> tuple[int, ...]: ...
+"""
+
+
+def test_what_can_move_the_robot_checks_of_configurations_tuples_and_attributes_are_counted(tmp_path: Path) -> None:
+    files = {
+        "__init__": "", "daemon/__init__": "", "daemon/loops/__init__": "", "daemon/loops/main_loop": LOOP,
+        "a": "import ccatp.b\n", "b": "", "c": "import ccatp.a\n", "survey/__init__": "",
+        "survey/kind": 'K = Kind(runner=Part("ccatp.survey.run:go"), page=Part("ccatp.c:go"))\n',
+        "survey/run": "from ccatp.beacons import x\n", "beacons/__init__": "", "beacons/x": "",
+    }  # fmt: skip
+    for name, text in files.items():
+        path = tmp_path / "ccatp" / f"{name}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    sources = read_sources(tmp_path, "ccatp")
+    names = ["", ".a", ".b", ".daemon", ".daemon.loops", ".daemon.loops.main_loop", ".survey", ".survey.run"]
+    assert [one.module for one in moving_sources(sources)] == [f"ccatp{name}" for name in names]
+    assert (sum(one.config_checks for one in sources), sum(one.bare_tuples for one in sources)) == (1, 1)
+    assert largest_classes(sources, 3) == [("ccatp.daemon.loops.main_loop.Loop", 3)]
 
 
 ROOT = Path(__file__).parents[2]

@@ -10,7 +10,14 @@ import sys
 from pathlib import Path
 
 from tools.metrics.frame_profile import MAIN_LOOP, MeasurementError, measure
-from tools.metrics.sizes import SMALL_FILE_LINES, duplicate_classes, read_sources, single_importer_modules
+from tools.metrics.sizes import (
+    SMALL_FILE_LINES,
+    duplicate_classes,
+    largest_classes,
+    moving_sources,
+    read_sources,
+    single_importer_modules,
+)
 
 _HERE = Path(__file__).resolve().parents[2]
 
@@ -18,6 +25,7 @@ _HERE = Path(__file__).resolve().parents[2]
 def size_rows(root: Path) -> dict[str, int]:
     """The figures that follow from the source alone."""
     package, tests, tools = (read_sources(root, folder) for folder in ("ccatp", "tests", "tools"))
+    moving = moving_sources(package)
     return {
         "ccatp: files": len(package),
         "ccatp: lines": sum(one.lines for one in package),
@@ -28,6 +36,11 @@ def size_rows(root: Path) -> dict[str, int]:
         f"ccatp: files under {SMALL_FILE_LINES} code lines": sum(one.code_lines < SMALL_FILE_LINES for one in package),
         "ccatp: single-importer files": len(single_importer_modules(package)),
         "ccatp: duplicate class names": len(duplicate_classes(package)),
+        "ccatp: isinstance of a configuration": sum(one.config_checks for one in package),
+        "ccatp: bare tuples of three or more": sum(one.bare_tuples for one in package),
+        "ccatp: attributes of the ten largest": sum(size for _, size in largest_classes(package, 10)),
+        "can move the robot: files": len(moving),
+        "can move the robot: lines": sum(one.lines for one in moving),
         "tests: files": len(tests),
         "tests: lines": sum(one.lines for one in tests),
         "tests: code lines": sum(one.code_lines for one in tests),
@@ -56,6 +69,7 @@ def list_names(root: Path) -> None:
         (f"files under {SMALL_FILE_LINES} code lines", small),
         ("single-importer files", single_importer_modules(package)),
         ("duplicate class names", duplicate_classes(package)),
+        ("largest classes, attributes", [f"{name} ({size})" for name, size in largest_classes(package, 10)]),
     ):
         print(f"\n{title}:", *names, sep="\n  ")
 

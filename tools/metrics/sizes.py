@@ -2,13 +2,16 @@
 
 import ast
 import io
+import re
 import tokenize
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 SMALL_FILE_LINES = 60
+_LOOP = re.compile(r"ccatp\.daemon\.(loops\.)?(main_loop|danger_loop)")
+_NAMED = (ast.Name, ast.Attribute)
 _LAYOUT = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -30,6 +33,10 @@ class Source(NamedTuple):
     classes: tuple[str, ...]
     functions: int
     imports: frozenset[str]  # candidates: every dotted name that an import statement may mean
+    parts: frozenset[str]  # modules of the parts of a kind of mission that move the robot, named by a string
+    config_checks: int  # isinstance of a configuration
+    bare_tuples: int  # functions that return a tuple of three or more values without a name
+    attributes: Mapping[str, int]  # by class: attributes that its methods set on self
 
 
 def read_sources(root: Path, package: str) -> list[Source]:
@@ -51,7 +58,32 @@ def read_source(path: Path, module: str) -> Source:
         tuple(node.name for node in nodes if isinstance(node, ast.ClassDef)),
         sum(isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) for node in nodes),
         frozenset(name for node in nodes for name in _imported(node)),
+        frozenset(name for node in nodes for name in _parts(node)),
+        sum(_is_config_check(node) for node in nodes),
+        sum(_returns_bare_tuple(node) for node in nodes),
+        {node.name: len(_attributes(node)) for node in nodes if isinstance(node, ast.ClassDef)},
     )
+
+
+def moving_sources(sources: Iterable[Source]) -> list[Source]:
+    """What can move the robot of a survey: all that main loop and danger loop import, without the indoor robots."""
+    known = {source.module: source for source in sources if ".beacons" not in source.module}
+    parts = {name for source in known.values() for name in source.parts}
+    waiting = [name for name in known if _LOOP.fullmatch(name)] + sorted(parts & known.keys())
+    found: set[str] = set()
+    while waiting:
+        if (name := waiting.pop()) in found:
+            continue
+        found.add(name)
+        parents = {name.rpartition(".")[0]} if "." in name else set()
+        waiting += ((known[name].imports | parents) & known.keys()) - found
+    return [known[name] for name in sorted(found)]
+
+
+def largest_classes(sources: Iterable[Source], count: int) -> list[tuple[str, int]]:
+    """Classes with the most attributes, and how many they have."""
+    every = [(f"{source.module}.{name}", size) for source in sources for name, size in source.attributes.items()]
+    return sorted(every, key=lambda one: (-one[1], one[0]))[:count]
 
 
 def duplicate_classes(sources: Iterable[Source]) -> list[str]:
@@ -91,3 +123,33 @@ def _imported(node: ast.AST) -> Iterator[str]:
     elif isinstance(node, ast.ImportFrom) and node.module is not None and not node.level:
         yield node.module
         yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def _parts(node: ast.AST) -> Iterator[str]:
+    if isinstance(node, ast.keyword) and node.arg in ("runner", "rules") and isinstance(node.value, ast.Call):
+        places = [one.value for one in node.value.args if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+        yield from (place.partition(":")[0] for place in places)
+
+
+def _is_config_check(node: ast.AST) -> bool:
+    if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "isinstance"):
+        return False
+    names = [
+        one.id if isinstance(one, ast.Name) else one.attr for one in ast.walk(node.args[1]) if isinstance(one, _NAMED)
+    ]
+    return any(name.endswith("Config") for name in names)
+
+
+def _returns_bare_tuple(node: ast.AST) -> bool:
+    returned = node.returns if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) else None
+    if not (isinstance(returned, ast.Subscript) and isinstance(returned.slice, ast.Tuple)):
+        return False
+    values = returned.slice.elts
+    is_tuple = isinstance(returned.value, ast.Name) and returned.value.id == "tuple"
+    is_open = any(isinstance(one, ast.Constant) and one.value is Ellipsis for one in values)
+    return is_tuple and not is_open and len(values) > 2
+
+
+def _attributes(node: ast.ClassDef) -> set[str]:
+    targets = [one for one in ast.walk(node) if isinstance(one, ast.Attribute) and isinstance(one.ctx, ast.Store)]
+    return {one.attr for one in targets if isinstance(one.value, ast.Name) and one.value.id == "self"}

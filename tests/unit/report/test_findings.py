@@ -16,21 +16,21 @@ from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.state_log import StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint
 from ccatp.report.findings import Grade, TimeBreakdown, findings_of, outcome_of, point_verdicts, spells_of, time_budget
-from ccatp.report.record import TOPICS_READ, RecordedSession, SurveyRecord, read_record
+from ccatp.report.record import TOPICS_READ, RecordedSession, SurveyFiles, read_record
 from ccatp.survey.composition import assemble
 
 
 @pytest.fixture(scope="module")
-def record(recorded: Path) -> SurveyRecord:
+def record(recorded: Path) -> SurveyFiles:
     return read_record(recorded)
 
 
-def only(record: SurveyRecord) -> RecordedSession:
+def only(record: SurveyFiles) -> RecordedSession:
     (session,) = record.sessions
     return session
 
 
-def test_a_whole_run_is_that_of_its_summary(record: SurveyRecord) -> None:
+def test_a_whole_run_is_that_of_its_summary(record: SurveyFiles) -> None:
     found, session = findings_of(record), only(record)
     assert (record.missing, record.warnings) == ((), ())
     assert (record.name, record.is_simulation, record.has_truth) == ("tonight", True, True)
@@ -62,7 +62,7 @@ def test_a_whole_run_is_that_of_its_summary(record: SurveyRecord) -> None:
     assert 0.9 < found.figures["within_sigma3"] <= 1.0
 
 
-def test_grades(record: SurveyRecord) -> None:
+def test_grades(record: SurveyFiles) -> None:
     points = [PointId(1, 2, number) for number in range(1, 6)]
     fixes = {one.point: one for one in record.measured}
     far = fixes[points[1]]
@@ -87,7 +87,7 @@ def test_grades(record: SurveyRecord) -> None:
 # -- time budget ------------------------------------------------------------------------------------------------------
 
 
-def budget_of(record: SurveyRecord, *changes: tuple[int, str, str], **fields: object) -> TimeBreakdown:
+def budget_of(record: SurveyFiles, *changes: tuple[int, str, str], **fields: object) -> TimeBreakdown:
     reported = tuple(StateChange(*change) for change in changes)
     session = replace(only(record), changes=reported, **fields)  # type: ignore[arg-type]
     found = time_budget(replace(record, sessions=(session,)))
@@ -95,7 +95,7 @@ def budget_of(record: SurveyRecord, *changes: tuple[int, str, str], **fields: ob
     return found
 
 
-def test_the_times_add_up_to_the_mission(record: SurveyRecord) -> None:
+def test_the_times_add_up_to_the_mission(record: SurveyFiles) -> None:
     found = time_budget(record)
     assert found is not None
     assert record.summary is not None
@@ -114,13 +114,13 @@ def test_the_times_add_up_to_the_mission(record: SurveyRecord) -> None:
     assert time_budget(replace(record, sessions=())) is None
 
 
-def test_a_longer_measurement_waited(record: SurveyRecord) -> None:
+def test_a_longer_measurement_waited(record: SurveyFiles) -> None:
     found = budget_of(record, (100, "idle", "measuring"), (250, "measuring", "held"), (300, "held", "done"))
     # 1 s idle, 1.5 s measuring of which half a second is due, half a second held, and nothing after the end.
     assert found.spent_s == {"measure": pytest.approx(0.5), "wait": pytest.approx(2.5)}
 
 
-def test_what_passed_while_main_was_restarted_is_a_row(record: SurveyRecord) -> None:
+def test_what_passed_while_main_was_restarted_is_a_row(record: SurveyFiles) -> None:
     """Main was gone from 3 s to 7 s of robot time; its successor speaks first before it has seen a frame."""
     reported = [
         (100, 1.0, 1.0, "driving"),

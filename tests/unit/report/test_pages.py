@@ -25,7 +25,7 @@ from ccatp.report.alignment import worst_corner
 from ccatp.report.compare import RunPair, compare_lines, compare_page, compared_figures
 from ccatp.report.findings import findings_of, outcome_of
 from ccatp.report.html import POLICY, environment, events_of, micro_text
-from ccatp.report.record import SurveyRecord, changed_keys, read_record
+from ccatp.report.record import SurveyFiles, changed_keys, read_record
 from ccatp.report.run_page import report_run, run_page
 from tests.support.command import answered, printed, refused
 from tests.support.pages import Markup
@@ -176,12 +176,12 @@ def test_alarms_that_were_active_at_the_end_are_on_the_page(recorded: Path) -> N
 # -- quality of the measurement ---------------------------------------------------------------------------------------
 
 
-def with_fixes(whole: SurveyRecord, fixes: tuple[FixMessage, ...]) -> SurveyRecord:
+def with_fixes(whole: SurveyFiles, fixes: tuple[FixMessage, ...]) -> SurveyFiles:
     (session,) = whole.sessions
     return replace(whole, sessions=(replace(session, fixes=fixes),))
 
 
-def moved(whole: SurveyRecord, fix: FixMessage, by_m: Vector3) -> FixMessage:
+def moved(whole: SurveyFiles, fix: FixMessage, by_m: Vector3) -> FixMessage:
     """A fix elsewhere, deck frame."""
     offset = np.array(whole.mirror.world_from_deck(by_m)) - whole.mirror.world_from_deck((0.0, 0.0, 0.0))
     return msgspec.structs.replace(fix, position_m=tuple((np.array(fix.position_m) + offset).tolist()))
