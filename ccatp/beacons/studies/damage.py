@@ -1,4 +1,4 @@
-"""The study `damage`: the filter on damaged windows of recorded runs, compared with the undamaged windows."""
+"""The study `damage`: causal estimators on damaged windows of recorded runs, compared with the undamaged windows."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -13,14 +13,15 @@ from ccatp.beacons.datasets.tables import RadioDataError, Table
 from ccatp.beacons.estimation.evaluation import TrackEvaluation, judge, truth_at
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, ReferencePath
 from ccatp.beacons.studies.recorded_sets import events_of, read_again, recorded_run, recorded_window, sets_in
-from ccatp.beacons.studies.recordings import FILTERS, EstimateError, estimate
+from ccatp.beacons.studies.recordings import EstimateError, estimate
 from ccatp.core import FloatArray
 from ccatp.missions import Part
 from ccatp.studies.campaign import Cell, Factors, Job, JobOutcome, Study
 
 WINDOW_S = 240.0
-WINDOWS = 3  # of each run, evenly spread
+WINDOWS = 3  # of each run, evenly spread; one of a run that is no longer than a window
 SILENCE_S = 60.0
+ESTIMATORS = ("fixed-lag", "ekf-slam")
 STRAIGHT_RAD = 0.35  # largest change of heading on a path that leaves mirror images possible
 EPOCH_S, LATE_S = 1e6, 1.5
 WRONG_SHARE, DELAYED_SHARE, ZERO_SHARE = 0.1, 0.25, 0.05
@@ -43,7 +44,7 @@ class Damage(NamedTuple):
     tables: Tables
     truth: ReferencePath | None
     run: RecordedRun  # undamaged
-    track: EstimatedPath  # of the filter on it
+    track: EstimatedPath  # of the estimator on it
     middle_s: float
     rng: np.random.Generator
 
@@ -244,27 +245,37 @@ OUTCOMES = ("recovered", "reported", "uncertain", "wrong", "impossible")
 @cache
 def cases_of(folder: str) -> list[tuple[str, int | None, int]]:
     """Set, robot and window of each case."""
-    sets = sets_in(folder).items()
-    return [(name, robot, window) for name, one in sets for robot in one.robots for window in range(WINDOWS)]
+    runs = [(name, robot) for name, one in sets_in(folder).items() for robot in one.robots]
+    return [
+        (name, robot, window)
+        for name, robot in runs
+        for window in range(WINDOWS if span_s(recorded_run(folder, name, robot)) > WINDOW_S else 1)
+    ]
+
+
+def span_s(run: RecordedRun) -> float:
+    """How long a run is."""
+    return float(run.steps.times_s[-1] - run.steps.times_s[0])
 
 
 @cache
-def _undamaged(folder: str, case: int, assumed: RecordingsConfig) -> tuple[RecordedRun, EstimatedPath, TrackEvaluation]:
+def _undamaged(
+    folder: str, case: int, assumed: RecordingsConfig, estimator: str
+) -> tuple[RecordedRun, EstimatedPath, TrackEvaluation]:
     name, robot, window = cases_of(folder)[case]
-    whole = recorded_run(folder, name, robot)
-    span_s = float(whole.steps.times_s[-1] - whole.steps.times_s[0])
-    begin_s = max(span_s - WINDOW_S, 0.0) * window / (WINDOWS - 1)
+    begin_s = max(span_s(recorded_run(folder, name, robot)) - WINDOW_S, 0.0) * window / (WINDOWS - 1)
     run = recorded_window(folder, name, robot, begin_s, WINDOW_S)
-    track = estimate(replace(run, truth=None), assumed, FILTERS[0])
+    track = estimate(replace(run, truth=None), assumed, estimator)
     return run, track, judge(track, run)
 
 
 def run_damage(job: Job) -> JobOutcome:
-    """Run the filter on one damaged window; its outcome is one of ``OUTCOMES``."""
+    """Run the estimator on one damaged window; its outcome is one of ``OUTCOMES``."""
     cfg, kind, case = job.cfg, str(job.factors["damage"]), job.seed % len(cases_of(job.cfg.run.data))
-    run, track, before = _undamaged(cfg.run.data, case, cfg)
+    estimator = str(job.factors["estimator"])
+    run, track, before = _undamaged(cfg.run.data, case, cfg, estimator)
     tables, truth = events_of(run, 0.0, WINDOW_S)
-    middle_s = float(run.steps.times_s[0]) + 0.5 * WINDOW_S
+    middle_s = float(run.steps.times_s[0]) + 0.5 * min(WINDOW_S, span_s(run))
     rng = np.random.default_rng((job.seed, list(DAMAGES).index(kind)))
     values: dict[str, Any] = {
         "case": " ".join(map(str, cases_of(cfg.run.data)[case])),
@@ -279,7 +290,7 @@ def run_damage(job: Job) -> JobOutcome:
         return JobOutcome(values | {"outcome": "impossible", "unsurveyed": "impossible"})
     try:
         again = read_again(damage.run, damage.tables, damage.truth)
-        found = estimate(replace(again, truth=None), cfg, FILTERS[0])
+        found = estimate(replace(again, truth=None), cfg, estimator)
     except (RadioDataError, EstimateError) as error:
         return JobOutcome(values | {"outcome": "reported", "unsurveyed": "reported", "new": [str(error)]})
     said = {_unnumbered(line) for line in (*run.warnings, *track.warnings)}
@@ -321,7 +332,7 @@ def combine_damage(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
 
 
 STUDY = Study(
-    cells=lambda: [Cell({"damage": name}) for name in DAMAGES],
+    cells=lambda: [Cell({"damage": name, "estimator": one}) for one in ESTIMATORS for name in DAMAGES],
     run_job=run_damage,
     combine=combine_damage,
     columns=f"{' '.join(OUTCOMES)} wrong_unsurveyed wrong_cases",

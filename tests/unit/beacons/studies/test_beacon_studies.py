@@ -186,7 +186,7 @@ def test_the_survey_of_a_moved_or_exchanged_beacon_follows(undamaged: Damage) ->
 
 def test_a_folder_of_recordings_is_needed() -> None:
     with pytest.raises(CampaignError, match="give --data DIR"):
-        run_damage(Job("damage", {"damage": "two clock epochs"}, 0, load_recordings_config()))
+        run_damage(Job("damage", {"damage": "two clock epochs", "estimator": "ekf-slam"}, 0, load_recordings_config()))
     with pytest.raises(CampaignError, match="started at most 80% later"):
         run_recordings(Job("recordings", {"data": "Plaza2", "estimator": "ekf-slam"}, 9, load_recordings_config()))
 
@@ -246,7 +246,7 @@ def test_the_studies_take_the_recordings_of_ones_own_folder(tmp_path: Path) -> N
     assert [one["data"] for one in levels] == ["first"] * 3 + ["fleet"] * 3
     found = run_recordings(Job("recordings", levels[0], 0, cfg)).values
     assert found["path_m"] < 0.3
-    damaged = run_damage(Job("damage", {"damage": "5 % ranges of 0 m"}, 0, cfg)).values
+    damaged = run_damage(Job("damage", {"damage": "5 % ranges of 0 m", "estimator": "ekf-slam"}, 0, cfg)).values
     assert damaged["outcome"] == "recovered"
     with pytest.raises(CampaignError, match="holds no recording"):
         sets_in(str(tmp_path / "none"))
@@ -256,5 +256,5 @@ def test_a_damage_that_needs_a_survey_is_impossible_without_one(tmp_path: Path) 
     lines = [line for line in csv_lines(world(seconds=60.0)) if not line.startswith("beacon")]
     write_lines(tmp_path / "one.csv", lines)
     cfg = load_recordings_config(None, {"run.data": str(tmp_path)})
-    factors = {"damage": "two beacons exchange names"}
+    factors = {"damage": "two beacons exchange names", "estimator": "fixed-lag"}
     assert run_damage(Job("damage", factors, 0, cfg)).values["outcome"] == "impossible"
