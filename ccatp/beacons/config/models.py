@@ -568,6 +568,7 @@ class RecordingsRunConfig(Model):
 
     seed: Annotated[int, Field(ge=0)]
     data: str
+    peer_limit_s: Positive
 
 
 class RecordingsConfig(Model):

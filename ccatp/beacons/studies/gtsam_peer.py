@@ -2,7 +2,8 @@
 
 Needs the extra ``peers`` (gtsam), imported only on request. Its stock factors have no calibration, so ranges and
 odometry are used as recorded. The noise is the same as ours, with Huber's loss for the readings. Beacons without
-bearings start at a place found by trilateration on GTSAM's own path.
+bearings start at a place found by trilateration on GTSAM's own path. Each beacon has a prior: that of a known map, or
+one so wide that it only keeps the equations regular while few readings have weight.
 """
 
 from collections.abc import Callable
@@ -25,6 +26,7 @@ would have no reading left, and GTSAM would stop."""
 LEAST_READINGS = 8
 SURE_MARGIN = 8.0
 SURE_SPREAD = 0.15
+WIDE = 10.0  # standard deviation of a beacon's prior, relative to its distance
 UNKNOWN = np.full((2, 2), np.nan)  # covariances of the peers are not computed
 
 
@@ -47,16 +49,23 @@ class Peers(NamedTuple):
     batch: EstimatedPath
 
 
-def run_gtsam(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float]) -> Peers:
-    """Both estimates of a run.
+Progress = Callable[[int], Callable[[int], None]]  # from the number of instants: what is called with those done
 
-    Raises PeerError: gtsam is not installed. Raises PeerGaveUp: its optimisation failed, or a reading has no range.
+
+def run_gtsam(
+    run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float], limit_s: float = np.inf,
+    progress: Progress = lambda _: lambda _: None,
+) -> Peers:  # fmt: skip
+    """Both estimates of a run. ``limit_s``: longest time of iSAM2, s.
+
+    Raises PeerError: gtsam is not installed. Raises PeerGaveUp: its optimisation failed, a reading has no range, or the
+    time is over.
     """
     gtsam = import_gtsam()
     if not np.isfinite(run.readings.range_m).all():
         raise PeerGaveUp(f"{run.name}: not all readings have a range, and GTSAM has no factor of signal strengths")
     try:
-        return _Session(gtsam, run, settings).solve(clock_s)
+        return _Session(gtsam, run, settings).solve(clock_s, limit_s, progress)
     except RuntimeError as error:
         raise PeerGaveUp(f"{run.name}: GTSAM gave up: {' '.join(str(error).split())[:120]}") from error
 
@@ -122,8 +131,9 @@ class _Session:
         self._waiting: dict[int, list[int]] = {}
         self._path = np.empty((len(self._times), 3))
 
-    def solve(self, clock_s: Callable[[], float]) -> Peers:
+    def solve(self, clock_s: Callable[[], float], limit_s: float, progress: Progress) -> Peers:
         gtsam, run = self._gtsam, self._run
+        show, started_s = progress(len(self._times)), clock_s()
         isam = gtsam.ISAM2(gtsam.ISAM2Params())
         rows_at = np.split(np.arange(len(self._at)), np.searchsorted(self._at, np.arange(1, len(self._times))))
         took = []
@@ -135,6 +145,7 @@ class _Session:
             graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
             if k == 0:
                 graph.add(gtsam.PriorFactorPose2(self._x(0), pose, prior))
+                self._know(graph, values)
             else:
                 step = gtsam.Pose2(*self._motion[k - 1])
                 noise = gtsam.noiseModel.Gaussian.Covariance(self._covariances[k - 1])
@@ -150,6 +161,12 @@ class _Session:
             pose = isam.calculateEstimatePose2(self._x(k))
             self._path[k] = pose.x(), pose.y(), pose.theta()
             took += [(clock_s() - begin_s) / max(len(rows_at[k]), 1)] * len(rows_at[k])
+            show(k + 1)
+            if clock_s() - started_s > limit_s:
+                raise PeerGaveUp(
+                    f"{run.name}: GTSAM was stopped after {limit_s:g} s, at {(k + 1) / len(self._times):.0%} of the "
+                    "run: run.peer_limit_s allows more"
+                )
         final = isam.calculateEstimate()
         isam2 = self._track(self._path, final, np.array(took))
         begin_s = clock_s()
@@ -159,6 +176,20 @@ class _Session:
         poses = np.array([(q.x(), q.y(), q.theta()) for q in map(best.atPose2, map(self._x, range(len(self._times))))])
         share = np.array([spent / max(len(self._at), 1)])
         return Peers(isam2, self._track(poses, best, share))
+
+    def _know(self, graph: Any, values: Any) -> None:
+        """Beacons of a known map, each with its own covariance."""
+        if (known := self._run.known_map) is None:
+            return
+        for k, name in enumerate(known.names):
+            beacon, at = self._run.beacon_ids.index(name), slice(2 * k, 2 * k + 2)
+            noise = self._gtsam.noiseModel.Gaussian.Covariance(known.covariance_m2[at, at])
+            self._insert(beacon, known.places_m[k], noise, graph, values)
+
+    def _insert(self, beacon: int, place: FloatArray, noise: Any, graph: Any, values: Any) -> None:
+        self._placed.add(beacon)
+        values.insert(self._l(beacon), place)
+        graph.add(self._gtsam.PriorFactorPoint2(self._l(beacon), place, noise))
 
     def _read(self, row: int, graph: Any, values: Any) -> None:
         """Add a factor for a reading if its beacon has a place; otherwise the reading waits until it has."""
@@ -170,8 +201,8 @@ class _Session:
             place = self._place(row, waiting)
             if place is None:
                 return
-            self._placed.add(beacon)
-            values.insert(self._l(beacon), np.array(place))
+            noise = self._gtsam.noiseModel.Isotropic.Sigma(2, WIDE * max(float(r.range_m[row]), 1.0))
+            self._insert(beacon, np.array(place), noise, graph, values)
             for earlier in self._waiting.pop(beacon):
                 graph.add(self._factor(earlier))
             return

@@ -23,7 +23,7 @@ from ccatp.beacons.estimation.evaluation import RECKONING, judge, reckoned_track
 from ccatp.beacons.estimation.level_fix import LevelLocator, fingerprint_fits, grid_points, judged
 from ccatp.beacons.estimation.path_loss import fit_path_loss
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
-from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, import_gtsam, run_gtsam
+from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, Progress, import_gtsam, run_gtsam
 from ccatp.beacons.studies.recorded_sets import SHIPPED, recorded_run, recorded_window, sets_in
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.filters.base import FilterError
@@ -69,7 +69,9 @@ COMPARED = (
 )  # fmt: skip
 
 
-def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[str]], None]) -> list[dict[str, Any]]:
+def compared(
+    run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[str]], None], progress: Progress
+) -> list[dict[str, Any]]:
     """A row of ``COMPARED`` for dead reckoning, each of our estimators, and GTSAM's.
 
     If GTSAM fails, its rows have no values, and there is a warning. Raises PeerError: GTSAM is not installed.
@@ -80,7 +82,7 @@ def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[s
         begin_s = perf_counter()
         tracks.append((name, estimate(run, assumed, name), perf_counter() - begin_s))
     try:
-        isam2, batch = run_gtsam(run, getattr(assumed, run.kind), perf_counter)
+        isam2, batch = run_gtsam(run, getattr(assumed, run.kind), perf_counter, assumed.run.peer_limit_s, progress)
         # The batch starts from the result of iSAM2, so its time is not that of a run.
         tracks += [(PEERS[0], isam2, float(isam2.update_s.sum())), (PEERS[1], batch, None)]
     except PeerGaveUp as error:
@@ -133,7 +135,8 @@ def run_recordings(job: Job) -> JobOutcome:
             track, run_s = estimate(run, cfg, estimator), None
         else:
             try:
-                track = run_gtsam(run, getattr(cfg, run.kind), perf_counter)[PEERS.index(estimator)]
+                peers = run_gtsam(run, getattr(cfg, run.kind), perf_counter, cfg.run.peer_limit_s)
+                track = peers[PEERS.index(estimator)]
             except PeerGaveUp:  # a mean over the other runs only could not be compared
                 return JobOutcome({"gave_up": True})
         run_s = perf_counter() - begin_s
