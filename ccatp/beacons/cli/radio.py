@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.beacons.cli.radio_levels import calibrate, fix, fuzzy
+from ccatp.beacons.cli.radio_levels import calibrate, coordinates, fix, fuzzy
 from ccatp.cli import common
 
 if TYPE_CHECKING:
     from ccatp.beacons.config.models import CricketConfig
     from ccatp.beacons.cricket.measured_map import MeasuredRanges
-    from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
+    from ccatp.beacons.estimation.recording import EstimatedPath, Known, RecordedRun
 
 FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 
@@ -23,6 +23,7 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 @common.command(
     "ccatp radio slam recordings/Plaza2_.mat",
     "ccatp radio slam recordings/MRCLAM_Dataset7 --robot 2 --filter smoother --json",
+    "ccatp radio slam mine.csv --map anchors.csv --start 0.5,2,1.57",
     "ccatp radio slam mine.csv --set csv.radio.range_sigma_m=0.3 --figure map.png",
 )
 @click.argument("path", type=common.PATH)
@@ -41,6 +42,10 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 @click.option(
     "--keep-heading", is_flag=True, help="Use a heading of the truth that is turned against its course as it is."
 )
+@click.option(
+    "--map", "map_file", type=common.PATH, help="Known places of beacons: the vehicle is localized among them."
+)
+@click.option("--start", metavar="X,Y,HEADING", help="First pose, in place of that of the truth: m, m, rad.")
 @click.option("--topics", "topics_file", type=common.PATH, help="Of a ROS bag: a TOML file that names its topics.")
 @common.figure_option("Draw map, path and residuals")
 @click.option(
@@ -60,10 +65,11 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 @common.JSON_OPTION
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
-    settings: Mapping[str, object], keep_heading: bool, topics_file: Path | None, figure_file: Path | None,
-    tum_file: Path | None, out_dir: Path | None, peers: bool, json_output: bool,
+    settings: Mapping[str, object], keep_heading: bool, map_file: Path | None, start: str | None,
+    topics_file: Path | None, figure_file: Path | None, tum_file: Path | None, out_dir: Path | None, peers: bool,
+    json_output: bool,
 ) -> None:  # fmt: skip
-    """Map the beacons of a recorded run and find the vehicle's path on that map.
+    """Map the beacons of a recorded run and find the vehicle's path on that map, or on a known one.
 
     PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, a CSV of events, tables with headers, a factor
     graph (pyfg), or a ROS bag (docs/radio_data.md).
@@ -76,7 +82,10 @@ def slam(
     from ccatp.studies.results import markdown_table
 
     assumed = load_recordings_config(config_file, settings)
-    run = read_run(path, data_format, robot, topics_file, turns_heading=not keep_heading)
+    known = _known(map_file, start)
+    run = read_run(path, data_format, robot, topics_file, turns_heading=not keep_heading, known=known)
+    if known.map is not None and known.first_pose is None and run.truth is None:
+        raise click.UsageError("--map: the run has no truth of its first pose; give it with --start X,Y,HEADING")
     common.warn(run.warnings)
     track = estimate(run, assumed, filter_name)
     common.warn(track.warnings)
@@ -94,7 +103,7 @@ def slam(
 
         draw_slam(run, track, judged, noise.camera_field_rad, figure_file, f"{run.name}, {filter_name}")
     if peers:
-        data["peers"] = compared(run, assumed, common.warn)
+        data["peers"] = compared(run, assumed, common.warn, partial(_progress, what="instants of GTSAM"))
     if json_output:
         click.echo(json.dumps(data, allow_nan=False))
         return
@@ -102,6 +111,17 @@ def slam(
     if peers:
         rows = ([one[key] for key in COMPARED] for one in data["peers"])
         common.print_lines(("", markdown_table(COMPARED, rows).rstrip()))
+
+
+def _known(map_file: Path | None, start: str | None) -> "Known":
+    from ccatp.beacons.datasets.known_map import read_known_map
+    from ccatp.beacons.estimation.recording import Known
+
+    known_map = None if map_file is None else read_known_map(map_file)
+    if start is None:
+        return Known(known_map)
+    x_m, y_m, heading_rad = coordinates(f"--start {start}", start, "X,Y,HEADING")
+    return Known(known_map, (x_m, y_m, heading_rad))
 
 
 def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:
@@ -242,16 +262,16 @@ def _write(path: Path, found: tuple[Any, Any, Any], layout: str) -> None:
     write_beacons(path, *found, frame)
 
 
-def _progress(total: int) -> Callable[[int], None]:
+def _progress(total: int, what: str = "runs") -> Callable[[int], None]:
     is_live = sys.stderr.isatty()
 
     def show(done: int) -> None:
         if total == 1:
             return
         if is_live:
-            click.echo(f"\rccatp: {done} of {total} runs", nl=done == total, err=True)
+            click.echo(f"\rccatp: {done} of {total} {what}", nl=done == total, err=True)
         elif 10 * done // total > 10 * (done - 1) // total:
-            common.complain(f"{done} of {total} runs", 0)
+            common.complain(f"{done} of {total} {what}", 0)
 
     return show
 

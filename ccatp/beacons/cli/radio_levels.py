@@ -137,7 +137,8 @@ def fix(
     common.print_result(result, _fix_lines(result), json_output)
 
 
-def _coordinates(option: str, text: str, wanted: str) -> list[float]:
+def coordinates(option: str, text: str, wanted: str) -> list[float]:
+    """The numbers of an option, as many as ``wanted`` names. Raises UsageError: they are not."""
     try:
         values_m = [float(part) for part in text.split(",")]
     except ValueError:
@@ -155,7 +156,7 @@ def _beacons(texts: Sequence[str]) -> "Places":
         option, (name, _, place) = f"--beacon {text}", map(str.strip, text.partition("="))
         if not name:
             raise click.UsageError(f"{option}: has no name; it is NAME=X,Y in metres, as in A=0,4")
-        x_m, y_m = _coordinates(option, place, "NAME=X,Y")
+        x_m, y_m = coordinates(option, place, "NAME=X,Y")
         if name in places_m:
             raise click.UsageError(f"{option}: {name} was given before; each beacon has one place")
         places_m[name] = (x_m, y_m)
@@ -169,7 +170,7 @@ def _room(text: str | None, places_m: "Places", spacing_m: float) -> "FloatArray
     from ccatp.beacons.estimation.level_fix import grid_points
 
     if text is not None:
-        x0, y0, x1, y1 = _coordinates(f"--room {text}", text, "X0,Y0,X1,Y1")
+        x0, y0, x1, y1 = coordinates(f"--room {text}", text, "X0,Y0,X1,Y1")
         if x1 <= x0 or y1 <= y0:
             raise click.UsageError(f"--room {text}: its second corner must be above and to the right of its first")
     else:

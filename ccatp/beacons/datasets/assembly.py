@@ -8,7 +8,7 @@ from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.events import EVENTS, MOTIONS, READING_KINDS, Recording
 from ccatp.beacons.datasets.ordering import ordered
 from ccatp.beacons.datasets.placeholders import frozen, measured, true_positions, without_wild_steps
-from ccatp.beacons.datasets.tables import RadioDataError, Table, long_pauses, needed_of, plural, within
+from ccatp.beacons.datasets.tables import RadioDataError, Table, listed, long_pauses, needed_of, plural, within
 from ccatp.beacons.datasets.trajectory import (
     BEFORE_S,
     at_antenna,
@@ -17,9 +17,10 @@ from ccatp.beacons.datasets.trajectory import (
     pose_of_truth,
     way_at,
 )
-from ccatp.beacons.estimation.recording import Readings, RecordedRun, ReferencePath, Steps
+from ccatp.beacons.estimation.recording import Known, KnownMap, Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray
 
+NOTHING = Known()
 LEAST_STEPS = 2
 LEAST_TRUTH = 2  # rows; a single position fits any path
 LARGEST = {1: (1e3, "a step forward", "m"), 2: (1e4, "a turn", "rad"), 3: (1e3, "a step to the left", "m")}
@@ -29,17 +30,18 @@ LATE_TRUTH_S, LATE_SHARE = 1.0, 0.5  # the run begins with the truth if that beg
 STILL_M, STILL_RAD = 0.1, 0.05  # unless the vehicle stands until then
 
 
-def checked_run(recording: Recording, *, turns_heading: bool = True) -> RecordedRun:
+def checked_run(recording: Recording, *, turns_heading: bool = True, known: Known = NOTHING) -> RecordedRun:
     """The run of a recording, ordered, without what cannot be, with a warning of each kind that was left out.
 
     ``turns_heading``: whether a heading of the truth that is turned against its course is corrected, or only reported.
-    Raises RadioDataError: there is no odometry or no reading of a beacon.
+    ``known``: what the estimators may use. Raises RadioDataError: there is no odometry or no reading
+    of a beacon, or none of a beacon on the map.
     """
     with np.errstate(all="ignore"):  # numbers that overflow are left out below
-        return _checked(recording, turns_heading)
+        return _checked(recording, turns_heading, known)
 
 
-def _checked(recording: Recording, turns_heading: bool) -> RecordedRun:
+def _checked(recording: Recording, turns_heading: bool, known: Known) -> RecordedRun:
     file, names, warnings = recording.file, recording.names, list(recording.warnings)
     tables = dict(recording.tables)
     surveyed, mounted = tables.pop("beacon", None), tables.pop("antenna", None)
@@ -53,7 +55,7 @@ def _checked(recording: Recording, turns_heading: bool) -> RecordedRun:
     steps = bridged(Steps(odometry.values[:, 0], *(odometry.values[1:, column] for column in (1, 2, 3))))
     readings, beacon_ids = _readings(recording, tables, steps, warnings)
     truth = _truth(truth_rows, steps, warnings, turns_heading)
-    first_pose = pose_of_truth(truth, steps, warnings)
+    first_pose = known.first_pose or pose_of_truth(truth, steps, warnings)
     if truth is not None and len(truth.times_s) < LEAST_TRUTH:
         warnings.append(
             f"no reference trajectory: the truth has {plural(len(truth.times_s), 'row')}, good for the first pose "
@@ -61,6 +63,10 @@ def _checked(recording: Recording, turns_heading: bool) -> RecordedRun:
         )
         truth = None
     places_m, heights_m = _survey(surveyed, names, warnings)
+    known_map = None
+    if known.map is not None:
+        heights_m |= _heights(known.map)
+        known_map = _of_beacons(known.map, beacon_ids, recording, warnings)
     ahead_m, left_m, up_m = _antenna(mounted)
     above_m = np.array([heights_m.get(beacon, np.nan) - up_m for beacon in beacon_ids])
     readings = _in_the_plane(readings, np.nan_to_num(above_m), warnings)
@@ -70,7 +76,7 @@ def _checked(recording: Recording, turns_heading: bool) -> RecordedRun:
         steps, truth, first_pose = at_antenna(steps, truth, first_pose, (ahead_m, left_m), warnings)
     run = RecordedRun(
         recording.name, recording.kind, steps, readings, beacon_ids, places_m, truth, first_pose, (),
-        (ahead_m, left_m),
+        (ahead_m, left_m), known_map,
     )  # fmt: skip
     # A row with two readings gives the same warning of each.
     return replace(run, warnings=tuple(dict.fromkeys((*warnings, *suspicions(run)))))
@@ -243,6 +249,27 @@ def _survey(
             raise RadioDataError(surveyed.file, f"beacon {name} was surveyed at another place before", line)
         heights_m[name] = z_m
     return places_m, heights_m
+
+
+def _heights(known_map: KnownMap) -> dict[str, float]:
+    heights = zip(known_map.names, known_map.heights_m.tolist(), strict=True)
+    return {name: height_m for name, height_m in heights if np.isfinite(height_m)}
+
+
+def _of_beacons(
+    known_map: KnownMap, beacon_ids: tuple[str, ...], recording: Recording, warnings: list[str]
+) -> KnownMap:
+    """The part of the map that has the beacons of the readings."""
+    here = known_map.of(beacon_ids)
+    if not here.names:
+        raise RadioDataError(
+            recording.file,
+            f"the map has none of its beacons: it has {listed(known_map.names)}, the readings are of "
+            f"{listed(beacon_ids)}",
+        )
+    if others := [name for name in beacon_ids if name not in here.names]:
+        warnings.append(f"beacons that the known map lacks are mapped: {listed(others)}")
+    return here
 
 
 def _antenna(mounted: Table | None) -> tuple[float, float, float]:

@@ -38,6 +38,7 @@ HEADERS = {
     "x": ("x", "pos_x", "position_x", "px", "tx"),
     "y": ("y", "pos_y", "position_y", "py", "ty"),
     "z": ("z", "pos_z", "position_z", "pz", "tz"),
+    "sigma": ("sigma", "std", "accuracy"),
     "heading": ("heading", "yaw", "theta", "phi", "orientation"),
     "qx": ("qx", "q_x", "orientation_x"),
     "qy": ("qy", "q_y", "orientation_y"),
@@ -165,6 +166,22 @@ def read_columns(path: Path) -> Recording:
         if {"beacon", "x", "y"} <= survey.quantities:
             events["beacon"] = _survey(survey, numbers)
     return Recording(readings[0], name_of(readings[0]), "csv", events, tuple(numbers), tuple(warnings))
+
+
+def read_survey(file: Path, text: str) -> tuple[list[str], FloatArray, FloatArray]:
+    """Names of beacons, their places x, y, z (n, 3), and the standard deviation of each coordinate (n,), NaN if none.
+
+    Raises RadioDataError: it is no table of places.
+    """
+    header = _header(text)
+    if not {"beacon", "x", "y"} <= {column.quantity for column in header if column}:
+        raise RadioDataError(file, "has no header with beacon, x and y, so it is no map")
+    table = _read(file, text)
+    at = table.column_of("beacon") or 0
+    names = [cells[at] for _, cells in table.rows]
+    if "" in names:
+        raise RadioDataError(file, "the place has no name of a beacon", table.rows[names.index("")][0])
+    return names, table.values("x", "y", "z").values, table.values("sigma").values[:, 0]
 
 
 def _is_text(file: Path) -> bool:

@@ -73,7 +73,7 @@ def is_events_csv(text: str) -> bool:
     """Whether the first line of a text is an event or the header, or the second line, if the first has only words."""
     lines = [cells for _, cells in _rows(text[:4096])[:2]]
     if lines and not any(is_number(cell) for cell in lines[0]):
-        return any(cells[0] in (*EVENTS, HEADER) for cells in lines)
+        return any(cells[0] == HEADER for cells in lines) or any(cells[0] in EVENTS for cells in lines[1:])
     return bool(lines) and lines[0][0] in EVENTS
 
 

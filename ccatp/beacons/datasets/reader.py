@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from ccatp.beacons.datasets.assembly import checked_run
+from ccatp.beacons.datasets.assembly import NOTHING, checked_run
 from ccatp.beacons.datasets.columns import is_columns, read_columns
 from ccatp.beacons.datasets.events import is_events_csv, read_events_csv
 from ccatp.beacons.datasets.formats import (
@@ -20,7 +20,7 @@ from ccatp.beacons.datasets.pyfg import is_pyfg, read_pyfg
 from ccatp.beacons.datasets.ros_bags import SUFFIXES as BAGS
 from ccatp.beacons.datasets.ros_bags import read_bag
 from ccatp.beacons.datasets.tables import NotTextError, RadioDataError, content_lines, read_text
-from ccatp.beacons.estimation.recording import RecordedRun
+from ccatp.beacons.estimation.recording import Known, RecordedRun
 
 TEXTS = (".txt", ".csv", ".tsv")
 READERS = {
@@ -35,12 +35,12 @@ FORMATS = ("plaza", "mrclam", "labyrinth", "csv", "columns", "pyfg", "bag")
 
 def read_run(
     path: Path, data_format: str | None, robot: int | None, topics_file: Path | None = None,
-    *, turns_heading: bool = True,
+    *, turns_heading: bool = True, known: Known = NOTHING,
 ) -> RecordedRun:  # fmt: skip
     """Read and check a recorded run.
 
     ``data_format``: one of ``FORMATS``; detected from the files if ``None``. ``topics_file``: only for a bag.
-    ``turns_heading``: see ``checked_run``. Raises RadioDataError: it cannot be read, or does not have the format.
+    ``turns_heading``, ``known``: see ``checked_run``. Raises RadioDataError: it cannot be read, or has another format.
     """
     data_format = found_format(path, data_format)
     if robot is not None and data_format != "mrclam":
@@ -50,7 +50,7 @@ def read_run(
             recording = read_mrclam(path, robot)
         else:
             recording = read_bag(path, topics_file) if data_format == "bag" else READERS[data_format](path)
-        return checked_run(recording, turns_heading=turns_heading)
+        return checked_run(recording, turns_heading=turns_heading, known=known)
     except RadioDataError as error:
         raise error.with_page() from error
 

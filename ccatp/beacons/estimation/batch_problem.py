@@ -1,5 +1,6 @@
 """The least-squares problem of a run: odometry between the instants of readings, residuals, normal equations."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ import numpy as np
 from ccatp.beacons.config.models import OdometryNoiseConfig, PriorsConfig, RecordingConfig
 from ccatp.beacons.estimation.measurement_models import bearing_row, level_row, range_row, range_variance
 from ccatp.beacons.estimation.motion import POSE, step_variances, turned_way
-from ccatp.beacons.estimation.recording import BoolArray, Readings, Steps, running_total
+from ccatp.beacons.estimation.recording import BeaconId, BoolArray, Readings, RecordedRun, Steps, running_total
 from ccatp.core import FloatArray, IntArray
 from ccatp.filters.metrics import wrapped
 
@@ -241,6 +242,24 @@ class BeaconNoise(NamedTuple):
         return cls(np.ones(count), np.ones(count), np.zeros(count), np.ones(count))
 
 
+class PlacePrior(NamedTuple):
+    """What is known of the places of beacons before the run: a Gaussian of the unknowns that are no poses."""
+
+    mean: FloatArray  # by ``SHARED`` and beacons, shape (11 + 4 b,)
+    information: FloatArray  # zero but for the places of known beacons, shape (11 + 4 b, 11 + 4 b)
+
+    @classmethod
+    def of_run(cls, run: RecordedRun, names: Collection[BeaconId]) -> "PlacePrior":
+        """The prior by the known map of a run, of those of its beacons that have ``names``."""
+        size = len(SHARED) + BEACON * len(run.beacon_ids)
+        mean, information = np.zeros(size), np.zeros((size, size))
+        if run.known_map is not None and (known := run.known_map.of([str(name) for name in names])).names:
+            starts = [len(SHARED) + BEACON * run.beacon_ids.index(name) for name in known.names]
+            rows = np.array([(start, start + 1) for start in starts]).ravel()
+            mean[rows], information[np.ix_(rows, rows)] = known.places_m.ravel(), np.linalg.inv(known.covariance_m2)
+        return cls(mean, information)
+
+
 @dataclass(slots=True)
 class Residuals:
     """Residuals at a state, and their derivatives.
@@ -267,15 +286,15 @@ class BatchProblem:
 
     ``times_s``: instants of the poses, beginning with the first odometry time, shape (n,). ``used``: mask of the
     beacons that are estimated, shape (b,); readings of others are ignored. ``marginal``: replaces the prior of the
-    first pose. ``noise``: of the ranges.
+    first pose. ``noise``: of the ranges. ``places``: what is known of them before the run.
     """
 
     def __init__(
         self, steps: Steps, readings: Readings, times_s: FloatArray, first_pose: tuple[float, float, float],
         settings: RecordingConfig, used: BoolArray, rest: tuple[float, float] = (0.0, 0.0),
-        marginal: MarginalPrior | None = None, noise: BeaconNoise | None = None,
+        marginal: MarginalPrior | None = None, noise: BeaconNoise | None = None, places: PlacePrior | None = None,
     ) -> None:  # fmt: skip
-        priors = settings.priors
+        priors, self._places = settings.priors, places
         rest = rest if priors.turn_bias_rad_s > 0.0 else (0.0, 0.0)
         self.reckoning = Reckoning(steps, times_s, delayed=priors.odometry_delay_s > 0.0, rest=rest)
         self.times_s, self.readings = times_s, readings
@@ -313,6 +332,9 @@ class BatchProblem:
         """Minus the logarithm of the priors, up to a constant."""
         shared = np.concatenate([state.shared, state.beacons.ravel()]) - self._prior_mean
         own = 0.5 * float(shared**2 @ self.prior_information)
+        if self._places is not None:
+            off = np.concatenate([state.shared, state.beacons.ravel()]) - self._places.mean
+            own += 0.5 * float(off @ self._places.information @ off)
         if self.marginal is not None:
             return own + self.marginal.cost(state)
         return own + 0.5 * float((state.poses[0] - self.first_pose) ** 2 @ self.first_information)
@@ -368,6 +390,9 @@ class BatchProblem:
         values = np.concatenate([state.shared, state.beacons.ravel()])
         corner += np.diag(self.prior_information)
         sides[1][:] -= self.prior_information * (values - self._prior_mean)
+        if self._places is not None:
+            corner += self._places.information
+            sides[1][:] -= self._places.information @ (values - self._places.mean)
         if self.marginal is None:
             block += np.diag(self.first_information)
             sides[0][:] -= self.first_information * (state.poses[0] - self.first_pose)
@@ -378,6 +403,18 @@ class BatchProblem:
         corner += L[POSE:, POSE:]
         sides[0][:] += side[:POSE]
         sides[1][:] += side[POSE:]
+
+    def assumed(self, shared: FloatArray, beacons: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information (k, k) of the priors of the free unknowns but poses, and its pull on their deviations, (k,).
+
+        Without what is measured at rest.
+        """
+        values, information = np.concatenate([shared, beacons.ravel()]), np.diag(self.assumed_information)
+        pull = self.assumed_information * values
+        if self._places is not None:
+            information += self._places.information
+            pull += self._places.information @ (values - self._places.mean)
+        return information[np.ix_(self.free, self.free)], pull[self.free]
 
     def spread(self, shared: FloatArray) -> FloatArray:
         """A step of the free shared unknowns as a step of all, (11 + 4 b,), zero for the fixed ones."""

@@ -5,7 +5,7 @@ of the filter.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import LinAlgError
 
 from ccatp.beacons.config.models import FixedLagConfig, RadioNoiseConfig, RecordingConfig, SlamFilterConfig
-from ccatp.beacons.estimation.batch_problem import BEACON, RSSI_REFERENCE, SHARED, BatchProblem, BatchState
+from ccatp.beacons.estimation.batch_problem import BEACON, RSSI_REFERENCE, SHARED, BatchProblem, BatchState, PlacePrior
 from ccatp.beacons.estimation.beacon_slam import BeaconSlam
 from ccatp.beacons.estimation.causal import beyond_priors, follow
 from ccatp.beacons.estimation.evaluation import aligned_beacons
@@ -104,10 +104,17 @@ def lagged_run(
         whole = smooth(recent, cfg, how, clock_s, (path, slam))
     except LinAlgError:
         return path
+    if run.known_map is not None:  # the smoother's map is in the frame of the known one
+        beacons = {name: fix for name, fix in whole.beacons.items() if name in path.beacons}
+        return path._replace(beacons=beacons, map_covariance=_part_of_map(whole, beacons))
     motion = best_motion(_ends(whole.poses), _ends(_poses_at(path, whole.times_s)))
     beacons = {name: fix for name, fix in aligned_beacons(whole, motion).items() if name in path.beacons}
-    at = columns_of(*((2 * k, 2 * k + 1) for k, name in enumerate(whole.beacons) if name in beacons))
-    return path._replace(beacons=beacons, map_covariance=motion.turned_map(whole.map_covariance)[np.ix_(at, at)])
+    return path._replace(beacons=beacons, map_covariance=motion.turned_map(_part_of_map(whole, beacons)))
+
+
+def _part_of_map(track: EstimatedPath, names: Collection[str]) -> FloatArray:
+    at = columns_of(*((2 * k, 2 * k + 1) for k, name in enumerate(track.beacons) if name in names))
+    return np.asarray(track.map_covariance[np.ix_(at, at)])
 
 
 def smooth(
@@ -128,7 +135,11 @@ def smooth(
     times_s = np.union1d(readings.times_s, steps_s[first])
     found = found or follow(run, settings, how, lambda: 0.0, SPACING_S)
     start, rest = _started(run, settings, found, times_s), (how.rest_speed_m_s, how.rest_turn_rad_s)
-    problem = BatchProblem(run.steps, readings, times_s, run.first_pose, settings, start.used, rest)
+    removed = {str(name) for name, _ in found[1].moved}
+    places = None
+    if run.known_map is not None:
+        places = PlacePrior.of_run(run, [name for name in run.beacon_ids if name not in removed])
+    problem = BatchProblem(run.steps, readings, times_s, run.first_pose, settings, start.used, rest, places=places)
     counted = problem.sizes > 0
     off = problem.residuals(start.state).chi2[counted] / problem.sizes[counted]
     state, softness = start.state, float(np.median(off)) if counted.any() else 0.0
@@ -140,7 +151,7 @@ def smooth(
         if radio == problem.radio:
             break
         settings = settings.model_copy(update={"radio": radio})
-        problem = BatchProblem(run.steps, readings, times_s, run.first_pose, settings, start.used, rest)
+        problem = BatchProblem(run.steps, readings, times_s, run.first_pose, settings, start.used, rest, places=places)
         state, converged = descend(problem, state, ITERATIONS)
     took_s = clock_s() - begin_s
     weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)

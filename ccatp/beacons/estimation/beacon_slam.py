@@ -1,7 +1,7 @@
 """EKF-SLAM: estimates the pose of a vehicle and a map of the beacons from odometry and readings."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from math import inf, log, sqrt
 
@@ -48,7 +48,7 @@ from ccatp.beacons.estimation.motion import (
     VehiclePose,
     estimated,
 )
-from ccatp.beacons.estimation.recording import BeaconEstimate, BeaconId, Reading
+from ccatp.beacons.estimation.recording import BeaconEstimate, BeaconId, KnownMap, Reading
 from ccatp.beacons.filters.ekf_slam import BlockError, Columns, EkfSlam, RowUpdate, columns_of
 from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
@@ -225,6 +225,16 @@ class BeaconSlam:
         at, mean = self._at(time_s), mean.copy()
         mean[:POSE] += self.engine.mean[:POSE] - at.pose  # the state is the pose after the odometry that is due
         self.engine.replace(self._columns(names, beacons), mean, covariance)
+
+    def know(self, known: KnownMap, kinds: Mapping[BeaconId, str]) -> None:
+        """Put beacons on the map before any reading. ``kinds``: of the readings of each, as in the models."""
+        for name, place_m in zip(known.names, known.places_m, strict=True):
+            extra = self._models.by_kind[kinds[name]].extra_prior
+            means, sigmas = zip((place_m[0], 1.0), (place_m[1], 1.0), *extra, strict=True)
+            self._map.join(name, np.array(means), np.diag(np.square(sigmas)))
+        starts = [self.engine.block(name).start for name in known.names]
+        columns = columns_of(*((start, start + 1) for start in starts))
+        self.engine.replace(columns, known.places_m.ravel(), known.covariance_m2)
 
     def likely(self) -> dict[BeaconId, FloatArray]:
         """Places x_m, y_m of waiting beacons that have one likely place, though readings bend over its width."""

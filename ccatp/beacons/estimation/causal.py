@@ -14,6 +14,7 @@ from ccatp.beacons.estimation.beacon_slam import BeaconInnovation, BeaconSlam, r
 from ccatp.beacons.estimation.motion import Increment
 from ccatp.beacons.estimation.recording import (
     BeaconFix,
+    BeaconId,
     Calibrated,
     EstimatedPath,
     Reading,
@@ -132,6 +133,8 @@ def follow(
     """
     sigmas = cfg.priors.pose_m, cfg.priors.pose_m, cfg.priors.heading_rad
     search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, np.diag(np.square(sigmas))))
+    if run.known_map is not None:
+        search.best.know(run.known_map, _kinds(run))
     window = None if lag is None else Window(run, cfg, how, lag)
     times = np.union1d(_spaced(run.steps.times_s, finest_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), list(_readings(run, cfg.radio.camera_field_rad))
@@ -239,6 +242,13 @@ def _unplaced(run: RecordedRun, slam: BeaconSlam) -> Iterator[str]:
     if slam.unplaced:
         early = f"{slam.unplaced} bearings had no range or strength of the same time"
         yield f"{early} and came before their beacon was placed"
+
+
+def _kinds(run: RecordedRun) -> dict[BeaconId, str]:
+    """Whether the distance of each beacon is measured by a range or a level."""
+    r = run.readings
+    ranged = np.unique(r.beacon[np.isfinite(r.range_m) | ~np.isfinite(r.rssi_dbm)]).tolist()
+    return {name: "range" if k in ranged else "rssi" for k, name in enumerate(run.beacon_ids)}
 
 
 def _spaced(times_s: FloatArray, finest_s: float) -> FloatArray:

@@ -45,7 +45,7 @@ def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
     """Compare a track with the truth of the run.
 
     One rigid motion without scale aligns the positions with the truth, and is applied to the beacons. If only the
-    beacons were surveyed, they are aligned themselves.
+    beacons were surveyed, they are aligned themselves. On a known map nothing is aligned.
     """
     truth = np.full((len(track.times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, track.times_s)
     known = np.isfinite(truth[:, 0])
@@ -54,7 +54,9 @@ def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
     common = [name for name in track.beacons if name in run.beacon_truth_m]
     places = np.array([(track.beacons[name].x_m, track.beacons[name].y_m) for name in common]).reshape(-1, 2)
     surveyed = np.array([run.beacon_truth_m[name] for name in common]).reshape(-1, 2)
-    if known.any():
+    if run.known_map is not None:
+        alignment = RigidMotion(np.eye(2), np.zeros(2))
+    elif known.any():
         alignment = best_motion(track.poses[known, :2], truth[known, :2])
     elif len(common) > 1:
         alignment = best_motion(places, surveyed)

@@ -1,6 +1,6 @@
 """Recorded runs and readings in SI units and order of time, and the results of the estimators."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import nan
 from typing import NamedTuple
@@ -68,13 +68,39 @@ class ReferencePath(NamedTuple):
     heading_rad: FloatArray  # shape (k,), rad, continuous; NaN if the reference measured positions alone
 
 
+class KnownMap(NamedTuple):
+    """Beacons whose places are known before the run, in the frame of the first pose."""
+
+    names: tuple[str, ...]
+    places_m: FloatArray  # x_m, y_m, shape (k, 2)
+    covariance_m2: FloatArray  # of all x_m, y_m in their order, shape (2 k, 2 k)
+    heights_m: FloatArray  # z_m, shape (k,); NaN where it is not known
+
+    def of(self, names: Sequence[str]) -> "KnownMap":
+        """The part of it that has some of these beacons, in their order."""
+        rows = [self.names.index(name) for name in names if name in self.names]
+        at = [2 * row + axis for row in rows for axis in range(2)]
+        return KnownMap(
+            tuple(self.names[row] for row in rows), self.places_m[rows], self.covariance_m2[np.ix_(at, at)],
+            self.heights_m[rows],
+        )  # fmt: skip
+
+
+class Known(NamedTuple):
+    """What is known of a run beside its recording."""
+
+    map: KnownMap | None = None
+    first_pose: tuple[float, float, float] | None = None  # of the vehicle: x_m, y_m, heading_rad
+
+
 @dataclass(frozen=True, slots=True)
 class RecordedRun:
     """One vehicle's run among beacons.
 
     ``beacon_truth_m``: surveyed x, y by name, world frame, m; beacons that were not surveyed are missing.
     ``first_pose``: x_m, y_m, heading_rad at the first odometry time, world frame: the only part of the truth that an
-    estimator may use; the origin if there is no truth.
+    estimator may use; the origin if there is no truth. ``known_map``: of beacons in ``beacon_ids``; the others are
+    mapped.
     """
 
     name: str
@@ -87,6 +113,7 @@ class RecordedRun:
     first_pose: tuple[float, float, float]
     warnings: tuple[str, ...]
     antenna_m: tuple[float, float] = (0.0, 0.0)  # ahead and left of the vehicle's origin; poses are the antenna's
+    known_map: KnownMap | None = None
 
 
 def running_total(amounts: FloatArray) -> FloatArray:

@@ -20,6 +20,7 @@ from ccatp.beacons.estimation.batch_problem import (
     BatchState,
     BeaconNoise,
     MarginalPrior,
+    PlacePrior,
     of_priors,
 )
 from ccatp.beacons.estimation.beacon_slam import BeaconSlam
@@ -72,6 +73,7 @@ class Window:
         self._last: _Solved | None = None
         self._seen: tuple[object, ...] = (0, 0)
         self._noise = BeaconNoise.configured(len(run.beacon_ids))
+        self._places = None if run.known_map is None else PlacePrior.of_run(run, run.beacon_ids)
         self._wide, self._cfg = cfg.priors, cfg.model_copy(update={"priors": narrowed(cfg.priors, ())})
         self._due_s, self._placed = self._begin_s, frozenset[str]()
         self._delayed = list[tuple[float, FloatArray, FloatArray]]()
@@ -166,7 +168,7 @@ class Window:
         steps = self._steps(begin_s, end_s)
         return BatchProblem(
             steps, readings, times_s, self._run.first_pose, self._cfg, used, self._rest, self._marginal,
-            self._noise,
+            self._noise, self._places,
         )  # fmt: skip
 
     def _solution(
@@ -251,9 +253,9 @@ class Window:
         state = BatchState(poses, last.state.shared, last.state.beacons)
         weights = t_weights(head.residuals(state).chi2, head.sizes, head.radio.freedom)
         information, side = eliminated(head.normal_equations(state, weights * head.power))
-        assumed, values = head.assumed_information[head.free], np.concatenate([state.shared, state.beacons.ravel()])
-        information[POSE:, POSE:] -= np.diag(assumed)  # the priors stay where they are
-        side[POSE:] += assumed * values[head.free]
+        assumed, pull = head.assumed(state.shared, state.beacons)
+        information[POSE:, POSE:] -= assumed  # the priors stay where they are
+        side[POSE:] += pull
         self._begin(cut_s, state, last.problem.used, head.free, information, side)
 
     def _begin(
@@ -283,13 +285,18 @@ class Window:
         size = POSE + len(SHARED) + beacons.size
         information = np.zeros((size, size))
         information[np.ix_(rows, rows)] = np.linalg.inv(P)
-        # The filter's calibration has priors, which stay where they are.
-        assumed = np.zeros(size)
-        own = rows[POSE : POSE + len(names)]
-        assumed[own] = of_priors(self._cfg.priors, used)[1][np.array(own, dtype=int) - POSE]
-        values, vectors = np.linalg.eigh(information - np.diag(assumed))
-        information = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        side = np.concatenate([np.zeros(POSE), shared, beacons.ravel()]) * assumed
+        # The filter's calibration and known places have priors, which stay where they are.
+        assumed, side, own = np.zeros((size, size)), np.zeros(size), rows[POSE : POSE + len(names)]
+        assumed[own, own] = of_priors(self._cfg.priors, used)[1][np.array(own, dtype=int) - POSE]
+        values = np.concatenate([shared, beacons.ravel()])
+        side[POSE:] = assumed.diagonal()[POSE:] * values
+        if self._places is not None:  # a beacon that was removed is not where it was surveyed
+            removed = {str(name) for name, _ in slam.moved}
+            self._places = PlacePrior.of_run(self._run, {one for one in slam.beacons if one not in removed})
+            assumed[POSE:, POSE:] += self._places.information
+            side[POSE:] += self._places.information @ (values - self._places.mean)
+        squares, vectors = np.linalg.eigh(information - assumed)
+        information = (vectors * np.maximum(squares, 0.0)) @ vectors.T
         state = BatchState(pose[None, :], shared, beacons)
         self._marginal = MarginalPrior.made(state, -1, used, information, side)
         self._begin_s = self._solved_s = time_s

@@ -3,7 +3,9 @@
 import json
 import sys
 import tomllib
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.estimation.evaluation import judge
+from ccatp.beacons.estimation.recording import KnownMap
 from ccatp.beacons.studies.gtsam_peer import PeerError, PeerGaveUp, run_gtsam
 from ccatp.cli import main
 from ccatp.filters.base import FilterDiverged
@@ -257,6 +260,58 @@ def test_what_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(PeerError, match=r"ccatp\[peers\]"):
         run_gtsam(run, SETTINGS, no_clock)
+
+
+def test_a_slow_peer_tells_how_far_it_is_and_stops_at_the_limit() -> None:
+    pytest.importorskip("gtsam", reason="the extra peers is not installed")
+    run, ticks, shown = recorded(world(seconds=20.0)), count(), list[int]()
+
+    def progress(total: int) -> Callable[[int], None]:
+        shown.append(total)
+        return shown.append
+
+    with pytest.raises(
+        PeerGaveUp, match=r"^simulated: GTSAM was stopped after 30 s, at 1\d% of the run: run.peer_limit"
+    ):
+        run_gtsam(run, SETTINGS, lambda: float(next(ticks)), 30.0, progress)
+    assert shown[0] == len(run.readings.times_s) + 1
+    assert shown[1:] == [*range(1, len(shown))]
+
+
+def test_a_peer_takes_a_known_map() -> None:
+    pytest.importorskip("gtsam", reason="the extra peers is not installed")
+    run, places_m = recorded(world(seconds=20.0), bearings=False), np.array([*BEACONS.values()])
+    run = replace(run, known_map=KnownMap(tuple(BEACONS), places_m, 1e-6 * np.eye(8), np.full(4, np.nan)))
+    for track in run_gtsam(run, SETTINGS, no_clock):
+        found = judge(track, run)
+        assert found.beacon_rmse_m == pytest.approx(0.0, abs=0.01)
+        assert found.trajectory_rmse_m == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_known_map_localizes_the_vehicle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From its third beacon and a start beside the true one, without a truth: the frame is that of the map."""
+    w = world(seconds=60.0)
+    lines = [line for line in csv_lines(w) if not line.startswith(("truth", "beacon"))]
+    file = write_lines(tmp_path / "mine.csv", lines)
+    rows = [f"{name},{x},{y},0.01" for name, (x, y) in BEACONS.items() if name != "9"]
+    write_lines(tmp_path / "anchors.csv", ["anchor,x,y,sigma_m", *rows, "unheard,1,2,0.01"])
+    options = ("--map", tmp_path / "anchors.csv", "--out", tmp_path / "out")
+    status, _, err = said(capsys, "radio", "slam", file, *options)
+    assert (status, "give it with --start X,Y,HEADING" in err) == (2, True)
+    status, _, err = said(capsys, "radio", "slam", file, *options, "--start", "3,1")
+    assert (status, "--start 3,1: is not X,Y,HEADING" in err) == (2, True)
+    data = reported(capsys, "slam", file, *options, "--start", "3.05,0.95,0.42", "--json")
+    assert "beacons that the known map lacks are mapped: 9" in data["warnings"]
+    assert not [line for line in data["warnings"] if "the first pose is the origin" in line]
+    for name, at in BEACONS.items():
+        assert data["beacons"][name] == pytest.approx(at, abs=0.05)
+    path = np.genfromtxt(tmp_path / "out/path.csv", delimiter=",", names=True)
+    true_m = [np.interp(path["time_s"], w.times_s, w.poses[:, k]) for k in range(2)]
+    off_m = np.hypot(path["x_m"] - true_m[0], path["y_m"] - true_m[1])
+    assert off_m[-100:].max() < 0.1
+    # The map of this run, with its joint covariance, is a known map again.
+    again = reported(capsys, "slam", file, "--map", tmp_path / "out/map.toml", "--start", "3,1,0.4", "--json")
+    assert again["beacons"]["9"] == pytest.approx(BEACONS["9"], abs=0.05)
 
 
 def test_slam_with_peers_prints_all_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
