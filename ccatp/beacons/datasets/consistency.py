@@ -20,13 +20,13 @@ LENGTHS = (("feet", 1.0 / 0.3048, 1.4), ("centimetres", 100.0, 3.2), ("millimetr
 USUAL = 0.9  # 75th percentile of |cos| of an angle: change of a range over the distance travelled
 WIDE = 20.0  # times survey and path together, which no range is long
 
-PER_WINDOW = 12  # readings of a beacon in a window,
+PER_WINDOW = 24  # readings of a beacon in a window: shorter ones do not tell a lag from another place of the beacon
 FEWEST = 8
-SHORTEST_WINDOW_S, LONGEST_WINDOW_S = 10.0, 60.0
+SHORTEST_WINDOW_S, LONGEST_WINDOW_S = 20.0, 60.0
 LEAST_GROUPS = 6
 LAGS_S = np.arange(-20.0, 20.01, 0.5)
 FINE_S = np.arange(-0.5, 0.501, 0.05)
-LEAST_LAG_S = 0.4  # smaller ones are the delay that the estimators calibrate
+LEAST_LAG_S = 0.6  # smaller ones are the delay that the estimators calibrate: two sigmas of its widest prior
 BETTER = 0.6  # of the misfit that remains with a lag, or in another unit
 MAJORITY = 0.65  # of the windows fit better
 FARTHEST = 5.0  # windows beyond this many usual misfits count as that
@@ -145,14 +145,19 @@ def _against_survey(run: RecordedRun, path: FloatArray) -> Iterator[str]:
 
 
 class _Windows:
-    """Ranges of each beacon in short windows, each fitted by the place of the beacon on the path by odometry.
+    """Readings of each beacon in short windows, each fitted by the place of the beacon on the path by odometry.
 
-    r^2 = |p|^2 - 2 p b + |b|^2 is linear in b and |b|^2, so no place, no pose and no truth has to be known.
+    r^2 = |p|^2 - 2 p b + |b|^2 is linear in b and |b|^2, so no place, no pose and no truth has to be known. Ranges that
+    most often have a bearing are fitted together with it: each such reading is a point at which the beacon is.
     """
 
     def __init__(self, run: RecordedRun) -> None:
         seen = run.readings.where(np.isfinite(run.readings.range_m) & (run.readings.range_m > 0.0))
-        self.times_s, self.range_m = seen.times_s, seen.range_m
+        pointed = np.isfinite(seen.bearing_rad)
+        self._is_pointed = bool(pointed.sum() > 0.5 * pointed.size)
+        if self._is_pointed:
+            seen = seen.where(pointed)
+        self.times_s, self.range_m, self.bearing_rad = seen.times_s, seen.range_m, seen.bearing_rad
         self.group: IntArray = np.full(len(seen.times_s), -1, dtype=np.int64)
         intervals = [np.diff(seen.times_s[seen.beacon == k]) for k in range(len(run.beacon_ids))]
         usual = [float(np.median(one)) for one in intervals if one.size]
@@ -169,6 +174,7 @@ class _Windows:
         self.count = int(kept.sum())
         rows = self.group >= 0
         self.times_s, self.range_m, self.group = self.times_s[rows], self.range_m[rows], self.group[rows]
+        self.bearing_rad = self.bearing_rad[rows]
         self.begin_s = np.full(self.count, np.inf)
         np.minimum.at(self.begin_s, self.group, self.times_s)
 
@@ -176,8 +182,13 @@ class _Windows:
         """Root mean square of the misfit of each window, m, if the path is taken ``lag_s`` later; shape (count,)."""
         at = _places(times_s, path, self.times_s + lag_s)
         counts = np.bincount(self.group, minlength=self.count)
+        if self._is_pointed:
+            way = np.interp(self.times_s + lag_s, times_s, path[:, 2]) + self.bearing_rad
+            at = at + self.range_m[:, None] * np.column_stack([np.cos(way), np.sin(way)])
         middle = np.column_stack([np.bincount(self.group, column, self.count) / counts for column in at.T])
         at = at - middle[self.group]
+        if self._is_pointed:
+            return np.asarray(np.sqrt(np.bincount(self.group, (at**2).sum(axis=1), self.count) / (2 * counts - 2)))
         weight = 0.5 / self.range_m  # an error of r^2 over 2 r is one of r
         rows = np.column_stack([at, np.ones(len(at))]) * weight[:, None]
         wanted = (self.range_m**2 - (at**2).sum(axis=1)) * weight

@@ -1,5 +1,6 @@
 """The path of every reader: order and clocks, placeholders, unknown motions at either end, headings that are none."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -268,11 +269,21 @@ def moved_clock(kind: str, by_s: float, from_s: float = 0.0) -> Change:
         (without("truth", scaled("odom", 3, 57.29578)), "turns 0.0175 times as much: are its turns in degrees?"),
         (scaled("beacon", 2, 1000.0), "are their places in millimetres or centimetres?"),
         (moved_clock("truth", -3.0), "the truth fits the odometry best if taken 3 s later"),
-        (without("truth", moved_clock("range", 3.0)), "ranges fit the odometry best if taken 3.1 s earlier"),
+        (without("truth", moved_clock("range", 3.0)), "ranges fit the odometry best if taken 3 s earlier"),
     ],
 )  # fmt: skip
 def test_a_unit_or_a_clock_of_another_kind_is_named(tmp_path: Path, change: Change, what: str) -> None:
     assert what in read(tmp_path, change)[1]
+
+
+@pytest.mark.parametrize("kinds", [("range",), ("range", "bearing")])
+def test_a_clock_of_readings_that_was_set_on_the_way_is_named(tmp_path: Path, kinds: tuple[str, ...]) -> None:
+    left_out = {"truth", "bearing"} - {*kinds}
+    lines = [line for line in csv_lines(world(seconds=240.0)) if line.split(",")[0] not in left_out]
+    for kind in kinds:
+        lines = moved_clock(kind, 1.5, 120.0)(lines)
+    said = " | ".join(read_run(write_lines(tmp_path / "mine.csv", lines), None, None).warnings)
+    assert re.search(r"in the second half of the run .* fit the odometry best if taken 1\.[456] s earlier", said)
 
 
 def test_a_check_that_fails_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
