@@ -380,3 +380,37 @@ def survey_doubts(track: EstimatedPath, surveyed_m: Mapping[str, tuple[float, fl
         )
         return [wrong] if miss_m > MISSED * expected_m else []
     return [f"{line}: the map misses the survey by {miss_m:.2g} m, else by {fit_m:.2g} m"]
+
+
+TOGETHER_S = 5.0  # readings within this time are looked at together,
+LEAST_TOGETHER = 8  # if there are as many, of two beacons
+# Mean NIS per degree of freedom of the better half of the beacons, above which all are off: with two beacons of two
+# degrees of freedom, by chance once in half a million.
+SUDDEN = 8.0
+
+
+def sudden_disagreement(track: EstimatedPath) -> list[str]:
+    """A warning if the readings of several beacons at once are far from what the filter expects.
+
+    Outliers, reflections and a moved beacon are off alone; a vehicle that was moved, or whose clock was set, sees all
+    beacons elsewhere.
+    """
+    found = track.innovations
+    if not found:
+        return []
+    times_s = np.array([one.time_s for one in found])
+    nis = np.array([one.nis / one.size for one in found])
+    _, beacon = np.unique([one.beacon for one in found], return_inverse=True)
+    worst, at_s = 0.0, 0.0
+    for begin_s in np.arange(times_s[0], times_s[-1], 0.2 * TOGETHER_S).tolist():
+        rows = slice(*np.searchsorted(times_s, (begin_s, begin_s + TOGETHER_S)))
+        counts = np.bincount(beacon[rows])
+        means = np.sort(np.bincount(beacon[rows], nis[rows])[counts > 0] / counts[counts > 0])
+        if means.size > 1 and counts.sum() >= LEAST_TOGETHER and means[(means.size - 1) // 2] > worst:
+            worst, at_s = float(means[(means.size - 1) // 2]), begin_s
+    if worst < SUDDEN:
+        return []
+    return [
+        f"readings of several beacons at once are off, at {at_s:.6g} s by {worst:.3g} times their expected squares: "
+        "was the vehicle moved, or a clock set?"
+    ]

@@ -35,7 +35,7 @@ Tables = dict[str, Table]
 
 
 class DamageImpossibleError(ValueError):
-    """A recording has not what a damage needs: two surveyed beacons apart."""
+    """A recording has not what a damage needs: two surveyed beacons apart, or readings after it."""
 
 
 class Damage(NamedTuple):
@@ -163,8 +163,13 @@ def moved(damage: Damage) -> Damage:
 
 
 def kidnapped(damage: Damage) -> Damage:
-    """The vehicle drives on for half of SILENCE_S without any recording, and the clocks stop meanwhile."""
+    """The vehicle drives on for half of SILENCE_S without any recording, and the clocks stop meanwhile.
+
+    Without any reading afterwards this leaves no trace, so it is no damage of the recording.
+    """
     begin_s, end_s = damage.middle_s, damage.middle_s + 0.5 * SILENCE_S
+    if not any((table.values[:, 0] >= end_s).any() for kind, table in damage.tables.items() if kind != "odom"):
+        raise DamageImpossibleError
     return damage.everything(lambda rows: _later(_cut(rows, begin_s, end_s), begin_s, begin_s - end_s))
 
 

@@ -9,8 +9,9 @@ import pytest
 
 from ccatp.beacons.datasets.ordering import clock_sets
 from ccatp.beacons.datasets.reader import read_run
-from ccatp.beacons.estimation.recording import RecordedRun
-from tests.unit.beacons.datasets.sets import csv_lines, world, write_lines
+from ccatp.beacons.datasets.tables import RadioDataError
+from ccatp.beacons.estimation.recording import RecordedRun, dead_reckoned
+from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, world, write_lines
 
 W = world(seconds=60.0)
 LINES = [line for line in csv_lines(W) if not line.startswith("bearing")]
@@ -284,6 +285,89 @@ def test_a_clock_of_readings_that_was_set_on_the_way_is_named(tmp_path: Path, ki
         lines = moved_clock(kind, 1.5, 120.0)(lines)
     said = " | ".join(read_run(write_lines(tmp_path / "mine.csv", lines), None, None).warnings)
     assert re.search(r"in the second half of the run .* fit the odometry best if taken 1\.[456] s earlier", said)
+
+
+Attack = Callable[[list[str], np.random.Generator], list[str]]
+
+
+def one_row(kind: str, column: int, change: Callable[[float, np.random.Generator], float]) -> Attack:
+    """A changed value in the first, the last or another row; the first odometry has no motion."""
+
+    def attack(lines: list[str], rng: np.random.Generator) -> list[str]:
+        count, first = sum(line.startswith(f"{kind},") for line in lines), int(kind == "odom")
+        row = int(rng.choice((first, count - 1, int(rng.integers(first + 1, count - 1)))))
+
+        def changed(k: int, cells: list[str]) -> list[str]:
+            value = change(float(cells[column]), rng) if k == row else cells[column]
+            return [*cells[:column], str(value), *cells[column + 1 :]]
+
+        return each(kind, changed)(lines)
+
+    return attack
+
+
+def all_rows(kind: str, column: int, *factors: float) -> Attack:
+    return lambda lines, rng: scaled(kind, column, float(rng.choice(factors)))(lines)
+
+
+def set_clock(*kinds: str) -> Attack:
+    """The clock of some events is off, in the whole run or from some time on."""
+
+    def attack(lines: list[str], rng: np.random.Generator) -> list[str]:
+        by_s, from_s = float(rng.choice((-1.0, 1.0)) * rng.uniform(2.0, 15.0)), float(rng.choice((0.0, 30.0)))
+        for kind in kinds:
+            lines = moved_clock(kind, by_s, from_s)(lines)
+        return lines
+
+    return attack
+
+
+UNIT_FACTORS = (1000.0, 100.0, 1.0 / 0.3048)
+ATTACKS: list[Attack] = [
+    one_row("odom", 2, lambda v, rng: v + float(rng.choice((-65.536, 5.0, 1000.0 * v)))),
+    one_row("odom", 2, lambda v, rng: float("nan")),
+    one_row("odom", 3, lambda v, rng: v + float(rng.choice((-6.2832, 6.2832, 3.0)))),
+    one_row("odom", 1, lambda v, rng: float(rng.choice((0.0, 1.7e9, v + 30.0)))),
+    one_row("range", 1, lambda v, rng: float(rng.choice((0.0, 1.7e9, v - 20.0)))),
+    one_row("range", 3, lambda v, rng: float(rng.choice((0.0, -1.0, 65.535, float("nan"))))),
+    one_row("truth", 2, lambda v, rng: v + float(rng.choice((-8.0, 8.0)))),
+    one_row("truth", 1, lambda v, rng: float(rng.choice((0.0, 1.7e9)))),
+    all_rows("range", 3, *UNIT_FACTORS),
+    all_rows("odom", 2, *UNIT_FACTORS),
+    all_rows("odom", 3, 57.29578, -1.0),
+    all_rows("beacon", 2, 1000.0, 100.0),
+    set_clock("range"),
+    set_clock("truth"),
+    set_clock("odom"),
+    lambda lines, rng: [*lines, *lines],
+    lambda lines, rng: lines[::-1],
+]
+# What the reader says of the sound run: its odometry was made from its truth.
+SOUND_SAYS = (
+    "odometry distance equals the truth (single steps agree within  per cent): it was made from the truth, and results "
+    "are better than odometry would give",
+    "odometry turns equal the truth: they were made from it",
+)
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_a_damage_is_mended_named_or_refused(tmp_path: Path, seed: int) -> None:
+    """The run is that without the damage, or a line says what is wrong with it."""
+    rng = np.random.default_rng(seed)
+    lines = ATTACKS[seed % len(ATTACKS)](in_time_order(LINES), rng)
+    try:
+        run = read_run(write_lines(tmp_path / "mine.csv", lines), None, None)
+    except RadioDataError:  # its text is one line, as of every refusal
+        return
+    if any(re.sub(r"[\d.]+", "", line) not in SOUND_SAYS for line in run.warnings):
+        return
+    path = dead_reckoned(run.steps, run.first_pose)
+    at = [np.interp(run.steps.times_s, W.times_s, column) for column in W.poses.T]
+    assert np.hypot(path[:, 0] - at[0], path[:, 1] - at[1]).max() < 0.05
+    where = [np.interp(run.readings.times_s, W.times_s, column) for column in W.poses.T]
+    places = np.array([BEACONS[name] for name in run.beacon_ids])[run.readings.beacon]
+    expected_m = np.hypot(places[:, 0] - where[0], places[:, 1] - where[1])
+    assert np.abs(run.readings.range_m - expected_m).max() < 0.3  # six sigmas
 
 
 def test_a_check_that_fails_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

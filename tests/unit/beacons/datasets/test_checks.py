@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.beacons.datasets.checks import survey_doubts, suspicions
+from ccatp.beacons.config.load import load_recordings_config
+from ccatp.beacons.datasets.checks import sudden_disagreement, survey_doubts, suspicions
 from ccatp.beacons.datasets.reader import read_run
+from ccatp.beacons.estimation.causal import filter_run
 from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, RecordedRun, ReferencePath, Steps
 from tests.unit.beacons.datasets.sets import (
     BEACONS,
@@ -196,3 +198,25 @@ def test_a_map_shows_errors_of_the_survey(survey: dict[str, tuple[float, float]]
 
 def test_a_vague_map_may_miss_the_survey() -> None:
     assert survey_doubts(mapped(sigma_m=2.0), {**BEACONS, "6": (3.0, 9.0), "7": (0.0, -3.0)}) == []
+
+
+def said_on_the_way(run: RecordedRun) -> list[str]:
+    cfg = load_recordings_config()
+    return sudden_disagreement(filter_run(run, cfg.csv, cfg.filter, lambda: 0.0))
+
+
+def test_a_vehicle_that_was_moved_sees_all_beacons_elsewhere() -> None:
+    away = (W.times_s[:-1] >= 60.0) & (W.times_s[:-1] < 75.0)
+    steps = SOUND.steps._replace(
+        distance_m=np.where(away, 0.0, SOUND.steps.distance_m), turn_rad=np.where(away, 0.0, SOUND.steps.turn_rad)
+    )
+    seen = READ.where((READ.times_s < 60.0) | (READ.times_s > 75.0))
+    (line,) = said_on_the_way(replace(SOUND, steps=steps, readings=seen))
+    assert "readings of several beacons at once are off, at 7" in line
+    assert "was the vehicle moved, or a clock set?" in line
+
+
+def test_a_sound_run_and_one_beacon_alone_that_is_off_are_no_move() -> None:
+    assert not said_on_the_way(SOUND)
+    hidden = (READ.beacon == 1) & (READ.times_s > 60.0) & (READ.times_s < 75.0)
+    assert not said_on_the_way(with_readings(range_m=READ.range_m + 2.0 * hidden))
