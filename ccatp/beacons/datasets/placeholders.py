@@ -141,7 +141,10 @@ def without_wild_steps(odometry: Table, warnings: list[str]) -> Table:
 
 
 def true_positions(truth: Table, what: str, warnings: list[str]) -> Table:
-    """Rows of time, x and y without positions of zero far from their neighbours, and without single jumps."""
+    """Rows of time, x and y without positions of zero far from their neighbours, and without single jumps.
+
+    ``truth``: in order of time.
+    """
     if len(truth.values) < LEAST_OTHERS:
         return truth
     at = truth.values[:, 1:3]
@@ -165,10 +168,15 @@ def true_positions(truth: Table, what: str, warnings: list[str]) -> Table:
     across_m = np.hypot(*(at[2:] - at[:-2]).T)
     jump = np.zeros(len(at), dtype=bool)
     jump[1:-1] = np.minimum(step_m[:-1], step_m[1:]) > SPIKE * (across_m + np.median(step_m)) + ZERO_M
+    # The first and the last have one neighbour: they are compared with what the vehicle travels in that time.
+    interval_s = np.maximum(np.diff(truth.values[:, 0]), 1e-9)
+    fast_m_s = float(np.percentile(step_m / interval_s, USUAL))
+    for end in (0, -1):
+        jump[end] = step_m[end] > SPIKE * fast_m_s * interval_s[end] + ZERO_M
     if jump.any():
         warnings.append(
             truth.note(
-                jump, f"of {what} that jump there and back (the first here, at {_first_s(truth, jump)}), not used"
+                jump, f"of {what} that jump away from the others (the first here, at {_first_s(truth, jump)}), not used"
             )
         )
         truth = truth.where(~jump)

@@ -106,9 +106,11 @@ def test_only_a_clock_is_set_where_two_ascending_parts_interleave(times_s: np.nd
 
 
 def test_motions_of_equal_times_are_added_up_and_of_the_truth_the_last_counts(tmp_path: Path) -> None:
+    x_m = W.poses[-1, 0] + 0.25
+
     def change(lines: list[str]) -> list[str]:
         row = next(k for k, line in enumerate(lines) if line.startswith("odom,30.0,"))
-        return [*lines[: row + 1], "odom,30.0,0.01,0.002", *lines[row + 1 :], "truth,60.0,7,8,9"]
+        return [*lines[: row + 1], "odom,30.0,0.01,0.002", *lines[row + 1 :], f"truth,60.0,{x_m},{W.poses[-1, 1]},9"]
 
     run, said = read(tmp_path, change)
     assert run.steps.distance_m[299] == pytest.approx(W.distance_m[299] + 0.01)
@@ -116,7 +118,7 @@ def test_motions_of_equal_times_are_added_up_and_of_the_truth_the_last_counts(tm
     assert "1 row of odometry of the same time as the next (the first here), added up" in said
     assert "1 row of truth of the same time as the next (the first here), the last one counts" in said
     assert run.truth is not None
-    assert run.truth.x_m[-1] == 7.0
+    assert run.truth.x_m[-1] == pytest.approx(x_m)
 
 
 @pytest.mark.parametrize(
@@ -179,9 +181,16 @@ def test_single_positions_of_zero_or_elsewhere_are_no_truth(tmp_path: Path) -> N
     run, said = read(tmp_path, zero)
     assert "7 rows of truth at zero (the first here, at 0 s), not used" in said
     run, said = read(tmp_path, with_value("truth", 2, "99", lambda k: k == 50))
-    assert "1 row of truth that jump there and back (the first here, at 5 s), not used" in said
+    assert "1 row of truth that jump away from the others (the first here, at 5 s), not used" in said
     assert run.truth is not None
     assert run.truth.x_m.max() < 20.0
+
+
+@pytest.mark.parametrize("row", [0, 600])
+def test_the_first_and_the_last_position_of_the_truth_may_be_wrong(tmp_path: Path, row: int) -> None:
+    run, said = read(tmp_path, with_value("truth", 2, "11.0", lambda k: k == row))
+    assert f"1 row of truth that jump away from the others (the first here, at {row / 10:g} s), not used" in said
+    assert run.first_pose == pytest.approx(W.poses[0], abs=0.06)  # a tenth of a second later at most
 
 
 def test_the_run_begins_and_ends_where_its_motion_is_known(tmp_path: Path) -> None:
@@ -343,11 +352,7 @@ ATTACKS: list[Attack] = [
     lambda lines, rng: lines[::-1],
 ]
 # What the reader says of the sound run: its odometry was made from its truth.
-SOUND_SAYS = (
-    "odometry distance equals the truth (single steps agree within  per cent): it was made from the truth, and results "
-    "are better than odometry would give",
-    "odometry turns equal the truth: they were made from it",
-)
+SOUND_SAYS = ("odometry distance equals the truth", "odometry turns equal the truth")
 
 
 @pytest.mark.parametrize("seed", range(50))
@@ -359,7 +364,7 @@ def test_a_damage_is_mended_named_or_refused(tmp_path: Path, seed: int) -> None:
         run = read_run(write_lines(tmp_path / "mine.csv", lines), None, None)
     except RadioDataError:  # its text is one line, as of every refusal
         return
-    if any(re.sub(r"[\d.]+", "", line) not in SOUND_SAYS for line in run.warnings):
+    if not all(line.startswith(SOUND_SAYS) for line in run.warnings):
         return
     path = dead_reckoned(run.steps, run.first_pose)
     at = [np.interp(run.steps.times_s, W.times_s, column) for column in W.poses.T]
