@@ -1,5 +1,6 @@
 """``ccatp align --points``: the alignment of points that another instrument measured."""
 
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.config.files import read_text
+from ccatp.config.files import read_input
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, Measured, PointId
@@ -26,8 +27,10 @@ from ccatp.mirror.foreign_points import (
 )
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mirror.mirror_alignment import SurveyResult, survey_result
-from ccatp.mirror.point_file import Reading, parse_points
+from ccatp.mirror.point_file import Reading, is_of_coordinate, parse_points
 from ccatp.records.run_reader import CONFIG, check_run_dir
+
+_MOST_BYTES = 1 << 24  # a hundred readings of each of 783 points are 5 MB
 
 
 class PointOptions(NamedTuple):
@@ -66,12 +69,32 @@ class AlignedPoints(NamedTuple):
                 f"repeated readings: {self.assigned.repeats} scatter by {1e6 * self.assigned.repeat_sigma_m:.1f} um "
                 f"along the normal, {1e6 * self.assigned.claimed_sigma_m:.1f} um are claimed"
             )
+        if self.assigned.by_position:
+            lines.append(
+                f"{self.assigned.by_position} readings are assigned to panels by position, as their labels name none: "
+                "a mirrored axis along which the mirror is symmetric would not show"
+            )
+        lines += [
+            f"point {'/'.join(map(str, point))} is {self.assigned.labels[point]!r} of the file"
+            for point in self._mentioned
+            if self.assigned.labels[point] != "/".join(map(str, point))
+        ]
         if self.factor > 1.0:
             lines.append(
                 f"standard deviations are multiplied by {self.factor**0.5:.2f}: the panels' residuals, or the repeated "
                 "readings, are larger than claimed"
             )
         return lines
+
+    @property
+    def _mentioned(self) -> list[PointId]:
+        """Points that warnings name."""
+        found = [
+            point
+            for panel in self.result.panels
+            for point in (*panel.outliers, *((panel.deciding,) if panel.deciding is not None else ()))
+        ]
+        return [*dict.fromkeys(found)]
 
     @property
     def data(self) -> dict[str, Any]:
@@ -93,6 +116,10 @@ def align_points(run_dir: Path | None, settings: Mapping[str, object], options: 
     if run_dir is not None:
         check_run_dir(run_dir)
     cfg = load_config(None if run_dir is None else run_dir / CONFIG, settings)
+    if options.sigma_m is not None and not is_of_coordinate(options.sigma_m):
+        raise UsageError(
+            f"--sigma-um: a sigma of {1e6 * options.sigma_m:.3g} um is none of a coordinate; give it in um"
+        )
     mirror = build_mirror(cfg.mirror)
     readings = parse_points(_text(options.points), str(options.points), options.unit)
     own = np.array([one.place_m for one in readings])
@@ -128,7 +155,10 @@ def _in_world(
     options: PointOptions, references: Path, readings: tuple[Reading, ...], own: FloatArray
 ) -> tuple[Fitted, tuple[Reading, ...], FloatArray]:
     """The fit of the instrument's frame, and the readings that are no references."""
-    named = {one.label: one.place_m for one in parse_points(_text(references), str(references), options.unit)}
+    world = parse_points(_text(references), str(references), options.unit)
+    named = {one.label: one.place_m for one in world}
+    if len(named) < len(world):
+        raise PointsError(f"{references}: a label stands on two lines; give each reference once")
     known = [at for at, one in enumerate(readings) if one.label in named]
     labels = [readings[at].label for at in known]
     if len(set(labels)) < len(labels):
@@ -139,12 +169,17 @@ def _in_world(
 
 
 def _text(path: Path) -> str:
+    """The text of a file in UTF-8, or in UTF-16 with a byte order mark, as spreadsheets write it."""
     try:
-        return read_text(path)
+        data = read_input(path, _MOST_BYTES)
+        text = data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
     except OSError as error:
         raise PointsError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise PointsError(f"{path}: is no text in UTF-8; export it as such") from error
+    if "\0" in text:
+        raise PointsError(f"{path}: is no text in UTF-8; export it as such")
+    return text
 
 
 def _covariance(one: Reading, options: PointOptions, turn: FloatArray) -> FloatArray:

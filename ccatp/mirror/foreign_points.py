@@ -21,6 +21,8 @@ _SAME_PLACE_M = 0.003  # repeated readings of a target
 _AXIS_SHIFT_M = 0.12  # between the optical frame and that of the azimuth axis, along the elevation axis
 _FRAME_RATIO = 10.0  # of residuals of the references without and with a mirrored axis, from which the frame is mirrored
 _TWICE = (1.8, 2.2)  # deviations over the target's offset if its sign is wrong
+# The middle of all points is never further from the surface: panels differ from it by tenths of a millimetre.
+_ON_SURFACE_M = 0.003
 
 
 class PointsError(UsageError):
@@ -120,10 +122,14 @@ def panel_of_label(label: str, mirror: Mirror) -> PanelId | None:
 
 
 class Assigned(NamedTuple):
-    """Measured points by panel, the point of each label, and how much repeated readings scatter."""
+    """Measured points by panel, the point of each label, and how much repeated readings scatter.
+
+    ``by_position``: readings whose label names no panel.
+    """
 
     measured: tuple[Measured, ...]
     labels: Mapping[PointId, str]
+    by_position: int
     repeat_sigma_m: float | None
     claimed_sigma_m: float
     repeats: int
@@ -142,6 +148,11 @@ def check_on_mirror(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: fl
             f"the points lie {1e3 * abs(middle):.2f} mm on the other side of the surface: the target's offset of "
             f"{1e3 * offset_m:+.2f} mm seems to have the wrong sign"
         )
+    if abs(middle - offset_m) > _ON_SURFACE_M:
+        raise PointsError(
+            f"the points lie {1e3 * middle:+.2f} mm from the surface, the target's offset is {1e3 * offset_m:+.2f} mm; "
+            "give --offset-mm"
+        )
     return heights
 
 
@@ -158,7 +169,7 @@ def _heights(mirror: Mirror, world: FloatArray) -> FloatArray:
 def _why_far(mirror: Mirror, points: Sequence[ForeignPoint], world: FloatArray, far: BoolArray, offset_m: float) -> str:
     first = points[int(np.argmax(far))]
     where = f"line {first.line} ({first.label or 'no label'}) is not on {mirror.name}"
-    for factor, text in ((1e3, "metres"), (1e-3, "thousandths of the unit given")):
+    for factor, text in ((1e3, "metres"), (25.4, "inches"), (1e-3, "thousandths of the unit given")):
         scaled = np.abs(_heights(mirror, world[far] * factor)[:, 2]) < _ON_MIRROR_M + abs(offset_m)
         if scaled.all():
             some = "these lines are" if not far.all() else "the file is"
@@ -185,9 +196,11 @@ def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float) -> A
     feet = check_on_mirror(mirror, points, offset_m)
     by_panel: dict[PanelId, list[int]] = defaultdict(list)
     wrong: list[tuple[int, PanelId, PanelId]] = []
+    by_position = 0
     for at, (one, (x, y, _)) in enumerate(zip(points, feet.tolist(), strict=True)):
         there = mirror.grid.nearest_panel(x, y)
         named = panel_of_label(one.label, mirror)
+        by_position += named is None
         if named is not None and named != there:
             wrong.append((at, named, there))
         by_panel[there if named is None else named].append(at)
@@ -197,7 +210,8 @@ def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float) -> A
     squares = claimed = 0.0
     repeats = 0
     for panel, rows in sorted(by_panel.items()):
-        for number, same in enumerate(_targets(points, rows), 1):
+        targets = _targets(points, rows)
+        for number, same in zip(_numbers(points, targets), targets, strict=True):
             places = np.array([points[at].place_m for at in same])
             covariance = np.mean([points[at].covariance_m2 for at in same], axis=0)
             normal = np.array(mirror.rotate_world_from_deck(mirror.panel(panel).axes[2]))
@@ -215,6 +229,7 @@ def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float) -> A
     return Assigned(
         tuple(measured),
         labels,
+        by_position,
         repeat_sigma_m=float(np.sqrt(squares / repeats)) if repeats else None,
         claimed_sigma_m=float(np.sqrt(claimed / repeats)) if repeats else 0.0,
         repeats=repeats,
@@ -243,6 +258,20 @@ def _targets(points: Sequence[ForeignPoint], rows: Sequence[int]) -> list[list[i
         else:
             groups.append([at])
     return groups
+
+
+def _numbers(points: Sequence[ForeignPoint], targets: Sequence[Sequence[int]]) -> list[int]:
+    """The numbers of a panel's targets: those of labels like ``3/7/4``, otherwise in the order of the file."""
+    found = dict[int, str]()
+    for same in targets:
+        match = _OURS.match(points[same[0]].label)
+        if match is None or match[3] is None or not match[3].isdecimal():
+            return [*range(1, len(targets) + 1)]
+        first = points[same[0]]
+        if int(match[3]) in found:
+            raise PointsError(f"line {first.line}: {first.label} names two points that are far from each other")
+        found[int(match[3])] = first.label
+    return [*found]
 
 
 def variance_factor(result: SurveyResult, assigned: Assigned) -> float:
