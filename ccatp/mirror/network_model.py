@@ -109,7 +109,7 @@ class Adjustment(NamedTuple):
         return self.covariance[part, part]
 
     @property
-    def by_noise(self) -> FloatArray:
+    def by_survey(self) -> FloatArray:
         """The part of the covariance that comes from the noise of the lengths, (n, n); the rest comes from priors."""
         scaled = self.covariance / np.sqrt(self.prior)[:, None]
         return np.asarray(self.covariance - scaled.T @ scaled)

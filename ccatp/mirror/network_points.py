@@ -20,12 +20,12 @@ _HOUR_S = 3600.0
 class CommonErrors(NamedTuple):
     """Errors of the points by the network, (3, r) each: change per independent error of standard deviation 1.
 
-    The first ``by_noise`` errors come from the noise of the lengths and differ between surveys; the others come from
+    The first ``by_survey`` errors come from the noise of the lengths and differ between surveys; the others come from
     the priors, and are equal in surveys by the same network.
     """
 
     of_point: Mapping[PointId, FloatArray]
-    by_noise: int
+    by_survey: int
 
 
 class RefinedSurvey(NamedTuple):
@@ -96,9 +96,9 @@ def _refined(
     survey: Sequence[Measured], column: Mapping[int, int], network: NetworkResult, row_of: Iterator[int]
 ) -> RefinedSurvey:
     adjusted = network.adjustment
-    by_noise = _root(adjusted.by_noise, adjusted.prior)
-    by_priors = _root(adjusted.covariance - adjusted.by_noise, adjusted.prior)
-    roots = np.hstack([by_noise, by_priors])
+    by_survey = _root(adjusted.by_survey, adjusted.prior)
+    by_priors = _root(adjusted.covariance - adjusted.by_survey, adjusted.prior)
+    roots = np.hstack([by_survey, by_priors])
     found, common = [], {}
     for one in survey:
         if not _has_lengths(one, column):
@@ -118,7 +118,7 @@ def _refined(
             residual_rms_m=float(np.sqrt(np.mean(adjusted.residuals_m[row, channels] ** 2))),
         )
         found.append(Measured(one.point, fix))
-    return RefinedSurvey(tuple(found), CommonErrors(common, by_noise.shape[1]), len(survey) - len(common))
+    return RefinedSurvey(tuple(found), CommonErrors(common, by_survey.shape[1]), len(survey) - len(common))
 
 
 def _root(covariance: FloatArray, prior: FloatArray) -> FloatArray:

@@ -87,7 +87,7 @@ def differing_errors(a: CalibratedSurveys | None, b: CalibratedSurveys | None) -
         return slice(None), slice(None)
     if not np.array_equal(a.network.adjustment.prior, b.network.adjustment.prior):
         return slice(None), slice(None)
-    return slice(a.surveys[0].common.by_noise), slice(b.surveys[0].common.by_noise)
+    return slice(a.surveys[0].common.by_survey), slice(b.surveys[0].common.by_survey)
 
 
 class RunPair:

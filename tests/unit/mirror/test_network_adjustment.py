@@ -130,8 +130,8 @@ def test_a_rigid_motion_of_all_collimators_shows_in_no_length_and_keeps_its_prio
             unit = motion / np.linalg.norm(motion)
             assert unit @ found.covariance[collimators, collimators] @ unit == pytest.approx(sigma**2, rel=1e-6)
             # All of it comes from the prior, and nothing from the noise.
-            assert unit @ found.by_noise[collimators, collimators] @ unit == pytest.approx(0.0, abs=1e-6 * sigma**2)
-    assert np.linalg.eigvalsh(found.by_noise).min() > -1e-18
+            assert unit @ found.by_survey[collimators, collimators] @ unit == pytest.approx(0.0, abs=1e-6 * sigma**2)
+    assert np.linalg.eigvalsh(found.by_survey).min() > -1e-18
 
 
 # -- what is found -----------------------------------------------------------------------------------------------------
