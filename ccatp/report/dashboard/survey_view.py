@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.core import PointId, Vector3
+from ccatp.core import Fix, Measured, PointId, Vector3
 from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, MissionStatus, TrackMessage
 from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.records.store import StoredSurvey
 from ccatp.records.summary import measured_error_m
 from ccatp.report.dashboard.history import TruthCompare
+from ccatp.report.dashboard.network_watch import NetworkWatch
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
 from ccatp.survey.events import PURPOSES
 from ccatp.survey.planning.route import ORDERS
@@ -103,6 +104,7 @@ class SurveyView(RunStateView):
         self.points = survey_points(mirror, cfg)
         super().__init__(points=len(self.points), is_sim=is_sim, series=SERIES, lines=LINES, run_dir=run_dir)
         self._laser: FixMessage | None = None
+        self._network = NetworkWatch(mirror, cfg)
         self._nis = (0.0, 0)  # and degrees of freedom, the last that was drawn
         self._mirror, self._puck_height_m = mirror, cfg.robot.puck_height_m
         self._index = {point: k for k, point in enumerate(self.points)}
@@ -117,6 +119,7 @@ class SurveyView(RunStateView):
         """Take what was measured and skipped before; when, the recording says."""
         for point, fix in survey.fixes:
             self._measured(point, fix.position_m)
+            self._network.add(Measured(point, fix))
         for row in survey.points:
             if row.status == "skipped" and row.point in self._index:
                 self._mark(self._index[row.point], SKIPPED)
@@ -145,7 +148,9 @@ class SurveyView(RunStateView):
         if fix.is_fused:
             self._series["jump"].add(self._mission_s(fix.t_s), round(fix.jump_mm, 4))
         if fix.is_fused and fix.point is not None:
-            error_mm = self._measured(PointId(*fix.point), fix.position_m)
+            point = PointId(*fix.point)
+            error_mm = self._measured(point, fix.position_m)
+            self._network.add(Measured(point, _fix_of(fix)))
             if error_mm is not None:
                 self._series["arrival"].add(self._mission_s(fix.t_s), error_mm)
 
@@ -184,4 +189,21 @@ class SurveyView(RunStateView):
             age_s = round(max(now_s - (self.links.fix_s or now_s), 0.0), 2)
             laser = {"dop": fix.dop, "residual_um": residual_um, "channels": fix.channels, "is_used": fix.is_fused}
             laser |= {"age_s": age_s}
-        return {**super()._levels(now_s), "laser": laser}
+        levels = super()._levels(now_s)
+        # The adjustment takes time, which nobody asks for while no page is open.
+        network = self._network.sentence(is_over=self.links.is_over) if self.is_watched else ""
+        return {**levels, "laser": laser, "facts": [("laser network", network)] if network else []}
+
+
+def _fix_of(message: FixMessage) -> Fix:
+    return Fix(
+        t_s=message.t_s,
+        position_m=message.position_m,
+        covariance_m2=tuple(message.covariance_m2),
+        dop=message.dop,
+        channels=tuple(message.channels),
+        residual_rms_m=message.residual_rms_m,
+        left_out=tuple(message.left_out),
+        lengths_m=tuple(message.lengths_m),
+        metrology=message.metrology,
+    )

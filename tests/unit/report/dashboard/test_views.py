@@ -1,6 +1,8 @@
 """The state of the pages of surveys and of missions among beacons, from messages in virtual time."""
 
 import json
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from math import hypot
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from ccatp.links.topics import (
 )
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import StoredPoint, StoredSurvey
+from ccatp.report.dashboard import network_watch
 from ccatp.report.dashboard.access import CommandRefusal, check_command, host_refusal, make_token, page_tokens
 from ccatp.report.dashboard.app import STATIC
 from ccatp.report.dashboard.history import replay
@@ -104,6 +107,52 @@ def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: SurveyView)
         (mission(outcome="stopped"), ""),
     ):
         assert reported(view, message)["mission"]["next_point"] == point
+
+
+def fixes_with_lengths(view: SurveyView, slipped_m: float) -> list[FixMessage]:
+    """Of all points of the view; the lengths of the first channel are too long by ``slipped_m``."""
+    rng, found = np.random.default_rng(3), []
+    for k, point in enumerate(view.points):
+        fix = fix_at(point, 0.0, 60.0 * k)
+        lengths = np.linalg.norm(np.array(fix.position_m) - MIRROR.collimators_m, axis=1)
+        lengths += 2e-6 * rng.normal(size=len(lengths))
+        lengths[0] += slipped_m
+        found.append(
+            msgspec.structs.replace(fix, channels=[*MIRROR.channels], lengths_m=lengths.tolist(), metrology="good")
+        )
+    return found
+
+
+class AtOnce(Executor):
+    """Computes where it is asked, in place of a thread."""
+
+    def __init__(self, *_: Any) -> None: ...
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done = Future[Any]()
+        done.set_result(fn(*args, **kwargs))
+        return done
+
+
+@pytest.mark.parametrize(
+    ("slipped_m", "text"),
+    [(0.0, "The laser network is consistent: "), (1e-3, f"channel {MIRROR.channels[0]} reads ")],
+)
+def test_the_page_says_whether_the_laser_network_is_consistent(
+    slipped_m: float, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(network_watch, "ThreadPoolExecutor", AtOnce)
+    view = SurveyView(MIRROR, CFG, is_sim=True)
+    fixes = fixes_with_lengths(view, slipped_m)
+    reported(view, BEGUN, *fixes[:1])
+    assert [reported(view)["facts"] for _ in range(2)] == [[], []]  # nobody looks
+    view.is_watched = True
+    assert reported(view)["facts"] == []  # it begins
+    ((name, sentence),) = reported(view)["facts"]
+    assert (name, "1 points with 8 lengths are too few" in sentence) == ("laser network", True)
+    reported(view, *fixes[1:])
+    ((_, sentence),) = reported(view)["facts"]
+    assert text in sentence
 
 
 def test_a_point_from_arrival_to_measured(view: SurveyView) -> None:
