@@ -195,14 +195,9 @@ def _panel_covariance(places: Places, result: NetworkResult) -> FloatArray:
 
 
 def _coverage(truth: Truth, result: NetworkResult) -> dict[str, tuple[int, int]]:
-    """By kind: values inside their 95 % interval, and all of them.
-
-    Without those that the lengths do not determine, and those that are suspect but not named.
-    """
+    """By kind: values inside their 95 % interval, and all of them."""
     covered: dict[str, tuple[int, int]] = {}
     for effect, value in truth.values.items():
-        if effect in result.undetermined or effect in result.suspects:
-            continue
         sigma = np.sqrt(np.diag(result.adjustment.covariance_of(effect)))
         total = result.adjustment.of(effect).copy()
         inside, of = covered.get(effect.kind.value, (0, 0))

@@ -4,8 +4,10 @@ Every effect has the prior of the configuration. One that the lengths contradict
 the score test of each candidate, the most significant first). Candidates are the effects themselves, the same from
 some point on, and single lengths. Among them the test decides with a probability of a false finding per survey that is
 configured. If another candidate explains the lengths nearly as well, both get the wide prior, and both are named. An
-effect that is suspect only (chance ``_SUSPECT``) gets the wide prior, too, and is not named: the uncertainties are then
-honest for errors that are too small to be found.
+effect that is suspect only (chance ``_SUSPECT``) gets the wide prior, too, and is not named.
+
+Errors of scale and drift that the test is too weak to find are larger than the noise of the panels. At the end each of
+the two has the mean of the usual and the wide prior, weighted by what the lengths say of it: ``prior_of_both``.
 
 The noise of the lengths is measured with all effects free, so that larger noise makes no findings.
 """
@@ -32,11 +34,13 @@ from ccatp.mirror.network_model import (
 )
 
 UNDETERMINED = 0.9  # ratio of the posterior to the prior sigma from which an effect is not determined by the lengths
-_SUSPECT = 0.02  # chance of a score by noise below which an effect gets the wide prior
+_SUSPECT = 1e-3  # chance of a score by noise below which an effect gets the wide prior
 _CLEAR = 13.8  # least difference of the chi-squares of two explanations, one of which is a thousand times as likely
 _GRID = 100  # first points at which a change is looked for; then at every point near the best
 _LEAST_PART = 5  # points before and after a change
 _MOST_FINDINGS = 40
+_AIR = EffectKind.SCALE, EffectKind.DRIFT
+_AIR_CHANGED = 0.1  # chance of a scale or drift beyond the usual prior, before the lengths
 _FRAME = 3  # collimators that must agree with each other to be a frame for the others
 _NEEDED = 4  # lengths of a point
 _LOCATED_FROM = 6  # lengths of a point, of which one can be found to be wrong
@@ -164,6 +168,7 @@ class NetworkSearch:
             for effect in self.effects:
                 if effect.kind is EffectKind.COLLIMATOR:
                     found = self._widened(found, effect)
+        found = self._with_air(found, adjustment)
         adjustment = adjust(self._used(found), dict(found.sigmas), adjustment.noise, adjustment)
         return self._result(state, found, findings, adjustment)
 
@@ -180,6 +185,18 @@ class NetworkSearch:
 
     def _widened(self, found: _Search, effect: Effect) -> _Search:
         return found._replace(sigmas={**found.sigmas, effect: self._moved[effect.kind]}, wide=found.wide | {effect})
+
+    def _with_air(self, found: _Search, adjustment: Adjustment) -> _Search:
+        """Scale and drift that were not found, with both their priors."""
+        sigmas = {
+            effect: prior_of_both(
+                float(adjustment.of(effect)[0]), float(adjustment.covariance_of(effect)[0, 0]),
+                self._usual[effect.kind], self._moved[effect.kind],
+            )
+            for effect in self.effects
+            if effect.kind in _AIR and effect not in found.wide
+        }  # fmt: skip
+        return found._replace(sigmas={**found.sigmas, **sigmas})
 
     def _narrowed(self, found: _Search, effect: Effect) -> _Search:
         sigmas = {one: sigma for one, sigma in found.sigmas.items() if one != effect}
@@ -359,6 +376,22 @@ class NetworkSearch:
             bad_points=found.bad_points,
             has_frame=self._has_frame(found),
         )
+
+
+def prior_of_both(value: float, variance: float, usual: float, moved: float) -> float:
+    """Sigma of a prior in place of the usual and the wide one: root of their mean square by the chances of both.
+
+    ``value`` and ``variance``: of the unknown with the ``usual`` prior. The chances are those by the lengths alone.
+    Where the lengths do not decide, the wide prior has nearly all of the mean square, so that intervals hold
+    whichever prior is true.
+    """
+    information = max(1.0 / variance - 1.0 / usual**2, 1e-6 / moved**2)
+    seen = value / (variance * information)  # by the lengths alone
+    squares = np.array([usual, moved]) ** 2
+    spreads = squares + 1.0 / information
+    exponents = -0.5 * seen**2 / spreads - 0.5 * np.log(spreads) + np.log([1.0 - _AIR_CHANGED, _AIR_CHANGED])
+    chances = np.exp(exponents - exponents.max())
+    return sqrt(float(chances @ squares / chances.sum()))
 
 
 def change_price(size: int, chance: float, count: int) -> float:

@@ -110,8 +110,13 @@ class Adjustment(NamedTuple):
 
     @property
     def by_survey(self) -> FloatArray:
-        """The part of the covariance that comes from the noise of the lengths, (n, n); the rest comes from priors."""
-        scaled = self.covariance / np.sqrt(self.prior)[:, None]
+        """The part of the covariance that differs between surveys, (n, n).
+
+        It comes from the noise of the lengths, and from the priors of scale and drift, which are of one survey; the
+        rest comes from the priors of the collimators and of the offsets.
+        """
+        is_common = np.concatenate([np.full(effect.size, effect.is_of_channel) for effect in self.slices])
+        scaled = (self.covariance / np.sqrt(self.prior)[:, None])[is_common]
         return np.asarray(self.covariance - scaled.T @ scaled)
 
 

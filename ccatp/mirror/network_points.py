@@ -20,7 +20,7 @@ _HOUR_S = 3600.0
 class CommonErrors(NamedTuple):
     """Errors of the points by the network, (3, r) each: change per independent error of standard deviation 1.
 
-    The first ``by_survey`` errors come from the noise of the lengths and differ between surveys; the others come from
+    The first ``by_survey`` errors differ between surveys (noise of the lengths, scale, drift); the others come from
     the priors, and are equal in surveys by the same network.
     """
 

@@ -13,6 +13,7 @@ from ccatp.config.files import write_file
 from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.adjuster_work import Made, check_moves, repeatability_m
 from ccatp.mirror.mirror_alignment import joint_covariance
+from ccatp.mirror.network_model import Effect
 from ccatp.mirror.network_points import CalibratedSurveys
 from ccatp.mirror.panel_alignment import PanelResult, mirror_wavefront
 from ccatp.report.figures import distribution_figure, errors_figure, time_figure
@@ -79,15 +80,19 @@ def panel_changes(
 
 
 def differing_errors(a: CalibratedSurveys | None, b: CalibratedSurveys | None) -> tuple[slice, slice]:
-    """The errors by the networks of two surveys that differ: those by noise, if the network is the same.
+    """The errors by the networks of two surveys that differ: those of one survey, if the network is the same.
 
-    Errors by the priors are then equal, and cancel. If the network has changed between the surveys, none cancel.
+    Errors by the priors of collimators and offsets are then equal, and cancel. If the network has changed between the
+    surveys, none cancel.
     """
-    if a is None or b is None or a.network.adjustment.slices != b.network.adjustment.slices:
-        return slice(None), slice(None)
-    if not np.array_equal(a.network.adjustment.prior, b.network.adjustment.prior):
+    if a is None or b is None or _channel_priors(a) != _channel_priors(b):
         return slice(None), slice(None)
     return slice(a.surveys[0].common.by_survey), slice(b.surveys[0].common.by_survey)
+
+
+def _channel_priors(found: CalibratedSurveys) -> dict[Effect, list[float]]:
+    adjusted = found.network.adjustment
+    return {effect: adjusted.prior[part].tolist() for effect, part in adjusted.slices.items() if effect.is_of_channel}
 
 
 class RunPair:

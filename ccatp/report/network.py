@@ -27,11 +27,18 @@ def sentence(found: CalibratedSurveys | None) -> str:
         return f"The laser network is consistent: {lengths} lengths, {noise}, no channel and no collimator has changed."
     if not network.has_frame:
         return (
-            "The laser network has changed: too few collimators agree with each other to say which of the others "
-            f"moved; survey all collimators again ({noise})."
+            "The laser network has changed, and keeps no frame of reference: fewer than three collimators agree with "
+            "each other, so nothing says which of them moved; survey all collimators again; until then each point is "
+            f"uncertain by {_share_um(found):.0f} um ({noise})."
         )
     changes = "; ".join(finding_text(found, one) for one in network.findings)
     return f"The laser network has changed: {changes} ({noise}); the panels are computed with it."
+
+
+def _share_um(found: CalibratedSurveys) -> float:
+    """Standard deviation of a coordinate of a point by the network, rms over the points of the first survey, um."""
+    errors = np.array([*found.surveys[0].common.of_point.values()])
+    return MICRO * float(np.sqrt(np.mean(np.sum(errors**2, axis=2)))) if len(errors) else 0.0
 
 
 def remarks(found: CalibratedSurveys | None) -> list[str]:
