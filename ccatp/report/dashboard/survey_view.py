@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ccatp.config.models import Config
@@ -150,7 +151,7 @@ class SurveyView(RunStateView):
         if fix.is_fused and fix.point is not None:
             point = PointId(*fix.point)
             error_mm = self._measured(point, fix.position_m)
-            self._network.add(Measured(point, _fix_of(fix)))
+            self._network.add(Measured(point, msgspec.convert(fix, Fix, from_attributes=True)))
             if error_mm is not None:
                 self._series["arrival"].add(self._mission_s(fix.t_s), error_mm)
 
@@ -193,17 +194,3 @@ class SurveyView(RunStateView):
         # The adjustment takes time, which nobody asks for while no page is open.
         network = self._network.sentence(is_over=self.links.is_over) if self.is_watched else ""
         return {**levels, "laser": laser, "facts": [("laser network", network)] if network else []}
-
-
-def _fix_of(message: FixMessage) -> Fix:
-    return Fix(
-        t_s=message.t_s,
-        position_m=message.position_m,
-        covariance_m2=tuple(message.covariance_m2),
-        dop=message.dop,
-        channels=tuple(message.channels),
-        residual_rms_m=message.residual_rms_m,
-        left_out=tuple(message.left_out),
-        lengths_m=tuple(message.lengths_m),
-        metrology=message.metrology,
-    )
