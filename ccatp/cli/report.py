@@ -92,6 +92,8 @@ def plot(run_dir: Path, out: Path | None) -> int:
 
 # Keys with an effect on the alignment, and on a replay. All others had their effect during the run.
 ALIGN_KEYS = ("align.", "robot.puck_height_m", "mirror.")
+# Keys of the laser by which its lengths are weighted.
+ETALON_KEYS = ("length_sigma_m", "length_sigma_per_m", "collimator_sigma_m", "offset_sigma_m", "refraction_sigma")
 REPLAY_KEYS = ("localizer.", "robot.", "mirror.", "run.filter")
 PROGRESS_S = 50.0
 
@@ -195,7 +197,8 @@ def align(
     cfg = survey.cfg
     mirror = build_mirror(cfg.mirror)
     planned = {point.panel for point in survey.planned}
-    result, network = align_survey(cfg, mirror, survey.measured, planned, [_measured_with(one, cfg) for one in others])
+    with_others = [_measured_with(one, cfg, settings) for one in others]
+    result, network = align_survey(cfg, mirror, survey.measured, planned, with_others)
     comparison = None if survey.injected is None else compare(result.panels, survey.injected)
     outliers = sum(len(panel.outliers) for panel in result.panels)
     facts = {
@@ -281,14 +284,16 @@ def _write_files(cfg: "Config", mirror: "Mirror", result: "SurveyResult", files:
     return refused
 
 
-def _measured_with(run_dir: Path, cfg: "Config") -> "Sequence[Measured]":
+def _measured_with(run_dir: Path, cfg: "Config", settings: Mapping[str, object]) -> "Sequence[Measured]":
     """The fixes of another survey by the same collimators."""
     from ccatp.records.run_reader import read_run
 
-    other = read_run(run_dir, {})
-    for name in ("mirror", "etalon"):
-        if getattr(other.cfg, name) != getattr(cfg, name):
-            raise UsageError(f"--with {run_dir}: its configuration of {name} is not that of the first run")
+    other = read_run(run_dir, settings)
+    if other.cfg.mirror != cfg.mirror:
+        raise UsageError(f"--with {run_dir}: its mirror is not that of the first run")
+    for name in ETALON_KEYS:
+        if getattr(other.cfg.etalon, name) != getattr(cfg.etalon, name):
+            raise UsageError(f"--with {run_dir}: its etalon.{name} is not that of the first run")
     return other.measured
 
 

@@ -40,7 +40,7 @@ from ccatp.mirror.panel_alignment import (
 from ccatp.sim.world import draw_misalignments
 from tests.support.command import answered, printed
 from tests.support.recorded import make_run, record
-from tests.support.scenario import MIRRORS, World, world_of
+from tests.support.scenario import MIRRORS, World, config_of, world_of
 
 HEIGHT_M = 0.05
 Truth = Mapping[PanelId, PanelMisalignment]
@@ -517,6 +517,29 @@ def test_the_table_tells_the_same(run_dir: Path, capsys: pytest.CaptureFixture[s
     assert "half-wavefront error" in out
     assert "inside its 99 % band" in out
     assert err == "ccatp: warning: panel 3/7: not used, because they are outliers: 3/7/6; measure them again\n"
+
+
+def with_lengths(one: Measured) -> Measured:
+    collimators = dict(zip(M1.channels, M1.collimators_m, strict=True))
+    lengths = tuple(float(np.linalg.norm(np.subtract(one.fix.position_m, collimators[k]))) for k in one.fix.channels)
+    return Measured(one.point, replace(one.fix, lengths_m=lengths))
+
+
+def test_two_surveys_of_a_night_are_adjusted_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Their servers may have different ports; a laser of other uncertainty is another one."""
+    rng = np.random.default_rng(2)
+    for name, panel, keys in (
+        ("first", ALIGNED, {}),
+        ("second", PanelId(4, 5), {"etalon__port": 4711}),
+        ("other", PanelId(4, 5), {"etalon__offset_sigma_m": 3e-6}),
+    ):
+        measured = [with_lengths(one) for one in survey(CFG, M1, {panel: LIES}, rng)]
+        make_run(tmp_path / name, config_of(**keys), M1.point_ids(panel), measured, None)
+    found = aligned(capsys, tmp_path / "first", "--with", str(tmp_path / "second"))
+    assert {one["survey"] for one in found["network"]["effects"] if one["kind"] == "scale"} == {0, 1}
+    assert [(one["row"], one["col"]) for one in found["panels"]] == [ALIGNED]
+    assert main(["align", str(tmp_path / "first"), "--with", str(tmp_path / "other")]) == 2
+    assert "its etalon.offset_sigma_m is not that of the first run" in capsys.readouterr().err
 
 
 def test_a_survey_without_a_panel_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
