@@ -73,9 +73,24 @@ def undetermined_text(found: CalibratedSurveys | None) -> str:
     return f"Not determined by these lengths: {names + ', and ' if names else ''}{GAUGE}."
 
 
+def air_text(found: CalibratedSurveys | None) -> str:
+    """Scale and drift by which the points are computed; empty if the network was not checked."""
+    if found is None:
+        return ""
+    adjusted, parts = found.network.adjustment, []
+    for effect in adjusted.slices:
+        if effect.is_of_channel or effect.since:
+            continue
+        value, sigma = float(adjusted.of(effect)[0]), float(np.sqrt(adjusted.covariance_of(effect)[0, 0]))
+        unit = "ppm" if effect.kind is EffectKind.SCALE else "ppm per hour"
+        parts.append(f"{effect.kind}{_of_survey(found, effect)} {_ppm(value, sigma, '+')} {unit}")
+    return f"The panels are computed with {', '.join(parts)}."
+
+
 def network_lines(found: CalibratedSurveys | None) -> list[str]:
     """The network in the output of ``ccatp align``."""
-    return [line for line in ("", sentence(found), undetermined_text(found)) if line or found is not None]
+    lines = "", sentence(found), air_text(found), undetermined_text(found)
+    return [line for line in lines if line or found is not None]
 
 
 def finding_text(found: CalibratedSurveys, finding: Finding) -> str:

@@ -17,7 +17,7 @@ from ccatp.report.alignment import worst_corner
 from ccatp.report.findings import Findings, Grade, coverage_of, findings_of, observation_of
 from ccatp.report.html import MICRO, Draw, RunReport, events_of, page_figures, render, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure
-from ccatp.report.network import network_data, sentence, undetermined_text
+from ccatp.report.network import air_text, network_data, sentence, undetermined_text
 from ccatp.report.plots import check_drawing
 from ccatp.report.record import WITHIN_MM, kind_of_run, read_record
 from ccatp.report.tables import write_tables
@@ -74,7 +74,7 @@ def run_page(found: Findings) -> str:
         alignment=found.alignment,
         data=run_data(found),
         network=sentence(found.network) if found.record.measured else "",
-        not_determined=undetermined_text(found.network),
+        network_more=f"{air_text(found.network)} {undetermined_text(found.network)}".strip(),
         figures=page_figures(run_drawings(found)),
         within_mm=f"{WITHIN_MM:.0f}",
         never=Counter(verdict.why for verdict in found.points if verdict.grade is Grade.OPEN),
