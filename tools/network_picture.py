@@ -9,7 +9,8 @@ from ccatp.config.load import load_config
 from ccatp.core import FloatArray
 from ccatp.mirror.length_integrity import LengthIntegrity
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.network_model import EffectKind, SurveyLengths, adjust, equal_effects
+from ccatp.mirror.network_adjustment import calibrate
+from ccatp.mirror.network_model import SurveyLengths
 from tools.network_campaign import Places, places_of
 
 OUT = Path(__file__).parents[1] / "docs" / "network.png"
@@ -41,13 +42,7 @@ def main() -> None:
         distances, sigmas, mirror.collimators_m, places.nominal_m,
         np.linspace(-0.5, 0.5, count), np.zeros(count, dtype=np.int64),
     )  # fmt: skip
-    usual = {
-        EffectKind.OFFSET: cfg.etalon.offset_sigma_m,
-        EffectKind.COLLIMATOR: cfg.etalon.collimator_sigma_m,
-        EffectKind.SCALE: cfg.etalon.refraction_sigma,
-        EffectKind.DRIFT: cfg.align.network.drift_sigma_per_h,
-    }
-    adjusted = adjust(given, {one: usual[one.kind] for one in equal_effects(len(there), 1)})
+    adjusted = calibrate(given, cfg.etalon, cfg.align.network, cfg.align.false_alarm).adjustment
     moves = np.einsum("ka,kan->kn", places.normals, adjusted.moves)
     share = 1e6 * np.sqrt(np.einsum("kn,np,kp->k", moves, adjusted.covariance, moves))
     drawn = [
