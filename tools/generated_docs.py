@@ -48,13 +48,16 @@ ABOUT = {
         "`health.retries` times is a fault."
     ),
     Group.FANS: (
-        "On an overhanging mirror the fans carry the robot: these conditions send it home or hold it, with the fans "
-        "at full duty. On other mirrors they are only reported."
+        "On an overhanging mirror the fans carry the robot: what is wrong with them sends it home or holds it, with "
+        "the fans at full duty; on other mirrors it is only reported. A low battery sends it home on every mirror."
     ),
-    Group.SURVEY: "The robot is held until an operator decides: resume, abort, or stop.",
+    Group.SURVEY: "Most of these hold the robot until an operator decides: resume, abort, or stop.",
     BEACONS: "Missions of robots among radio beacons (`system` in the configuration).",
     Group.STORAGE: "A fix counts once it is on the disk; the survey does not continue without it.",
-    Group.OBSERVATORY: "Code 2, latched until it is cleared by its id (`ccatp clear ID`), across restarts.",
+    Group.OBSERVATORY: (
+        "Code 2, latched until it is cleared by its id (`ccatp clear ID`), across restarts of processes and of the "
+        "service."
+    ),
 }
 
 

@@ -58,7 +58,8 @@ _COMPARED = """
 abort      the robot drives home; the run ends there, status 3
 stop       the robot stays where it is; the run ends at once, status 4
 emergency  the robot drives home, or stands in an earthquake; latched until the observatory clears it
-pause      the robot stays where it is; the run goes on with resume
+pause      the robot stays where it is until resume; a new emergency or a
+           low battery sends it home all the same
 """
 
 
