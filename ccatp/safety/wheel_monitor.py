@@ -13,8 +13,6 @@ from ccatp.safety.escalation import Since
 from ccatp.safety.monitor import Monitor
 from ccatp.safety.motion_sums import MotionSum, SlidingWindow
 
-# After this time a command has less than 2 % effect on a wheel (servo 0.1 s, link 40 ms).
-_MEMORY_S = 0.4
 # The set points are known in steps of five frames, and reach the wheels two link delays later.
 _LATENCY_S = 0.1
 LATE_S = 0.1
@@ -118,7 +116,7 @@ class WheelMonitor(Monitor):
 
     def learn(self, t_s: float) -> None:
         """Update the recent set points at ``t_s``, when a new span was taken or was due."""
-        self._recent = self._commanded_over(t_s, _MEMORY_S)
+        self._recent = self._commanded_over(t_s, self._cfg.stop_time_s)
         self._stall = self._commanded_over(t_s, self._cfg.stall_time_s + _LATENCY_S)
 
     def _commanded_over(self, t_s: float, memory_s: float) -> SetPointSpan | None:
@@ -169,7 +167,7 @@ class WheelMonitor(Monitor):
         if recent is not None and t_s - recent.t_s <= _LATENCY_S:
             return recent
         # The commands since then are not known. If the robot has held its wheels for long enough, none has effect.
-        is_held = self._held_since_s is not None and t_s - self._held_since_s >= _MEMORY_S
+        is_held = self._held_since_s is not None and t_s - self._held_since_s >= self._cfg.stop_time_s
         return SetPointSpan(t_s, 0.0, 0.0, 0.0, 0.0) if is_held else None
 
     def _find_runaway(
@@ -219,7 +217,7 @@ class WheelMonitor(Monitor):
         self, now: MotionSum, moved: MotionSum, commanded: SetPointSpan, samples: Sequence[WheelSample]
     ) -> None:
         """Find motion at a set point of zero, except while a robot behind a stalled link executes its last command."""
-        runs_down_s = _MEMORY_S + self._cfg.stall_time_s
+        runs_down_s = self._cfg.stop_time_s + self._cfg.stall_time_s
         is_running_down = self._late_s is not None and now.t_s - self._late_s < runs_down_s
         if is_running_down or not commanded.is_zero:
             self._stood = None
