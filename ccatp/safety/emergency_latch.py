@@ -44,15 +44,14 @@ def cause_of(kind: EmergencyKind) -> Cause:
 class EmergencyLatch:
     """Code 2 holds while any emergency is active.
 
-    Each id is raised once and cleared once; repeats have no effect. A clear is refused while a level input reports that
-    the cause persists (``set_level``), while the robot is neither at base nor held, and for an id that was never
-    raised. ``raised`` counts the emergencies latched so far.
+    Each id is raised once and cleared once; repeats have no effect. A clear is refused while the robot is neither at
+    base nor held, and for an id that was never raised. No input reports whether the cause is gone: who clears answers
+    for it. ``raised`` counts the emergencies latched so far.
     """
 
     def __init__(self) -> None:
         self._active: dict[str, Emergency] = {}
         self._cleared: dict[str, None] = {}
-        self._levels: set[EmergencyKind] = set()
         self.raised = 0
 
     @property
@@ -95,10 +94,6 @@ class EmergencyLatch:
         """Whether the emergency with this id is active."""
         return emergency_id in self._active
 
-    def set_level(self, kind: EmergencyKind, active: bool) -> None:
-        """Set a level input (contact of a fire panel, alarm of a seismometer). While on, its kind cannot be cleared."""
-        (self._levels.add if active else self._levels.discard)(kind)
-
     def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
         """Latch an emergency; returns why it was refused, or None. A repeated or cleared id has no effect."""
         if emergency_id in self._cleared:
@@ -124,8 +119,6 @@ class EmergencyLatch:
         emergency = self._active.get(emergency_id)
         if emergency is None:
             return "no emergency with that id"
-        if emergency.kind in self._levels:
-            return f"the cause persists: {emergency.kind}"
         if not at_base_or_held:
             return "the robot is neither at base nor held"
         del self._active[emergency_id]
