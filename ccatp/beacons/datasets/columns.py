@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from ccatp.beacons.datasets.events import EVENTS, READING_KINDS, Recording, is_e
 from ccatp.beacons.datasets.placeholders import true_positions
 from ccatp.beacons.datasets.tables import (
     COMMENTS,
+    NotTextError,
     RadioDataError,
     Table,
     content_lines,
@@ -141,14 +143,15 @@ def read_columns(path: Path) -> Recording:
     ``path``: the table of readings, or a folder with one. Raises RadioDataError: one of the first two is missing.
     """
     folder = path if path.is_dir() else path.parent
-    texts = {file: read_text(file) for file in sorted(folder.iterdir()) if _is_text(file)}
+    texts = _texts(folder)
     readings = [file for file, text in texts.items() if is_columns(text)] if path.is_dir() else [path]
     if len(readings) != 1:
         raise RadioDataError(path, f"holds {len(readings)} tables of readings: name one")
     if not is_columns(text := read_text(readings[0])):
         raise RadioDataError(readings[0], "has no header with a time and ranges, bearings or levels by beacon")
-    tables = {file: _read(file, text) for file, text in texts.items() if file not in readings and any(_header(text))}
-    tracks = {file: one for file, one in tables.items() if "time" in one.quantities and _is_motion(one)}
+    others = {file: text for file, text in texts.items() if file not in readings and _is_other_table(text)}
+    tables = {file: _read(file, text) for file, text in others.items()}
+    tracks = {file: one for file, one in tables.items() if "time" in one.quantities and _is_motion(one.quantities)}
     truths = {file: one for file, one in tracks.items() if TRUTH_NAME.search(file.name)}
     odometry = [one for file, one in tracks.items() if file not in truths]
     if len(odometry) != 1 or len(truths) > 1:
@@ -163,8 +166,7 @@ def read_columns(path: Path) -> Recording:
     for truth in truths.values():
         events["truth"] = truth.poses()
     for survey in (one for one in tables.values() if "time" not in one.quantities):
-        if {"beacon", "x", "y"} <= survey.quantities:
-            events["beacon"] = _survey(survey, numbers)
+        events["beacon"] = _survey(survey, numbers)
     return Recording(readings[0], name_of(readings[0]), "csv", events, tuple(numbers), tuple(warnings))
 
 
@@ -184,8 +186,14 @@ def read_survey(file: Path, text: str) -> tuple[list[str], FloatArray, FloatArra
     return names, table.values("x", "y", "z").values, table.values("sigma").values[:, 0]
 
 
-def _is_text(file: Path) -> bool:
-    return file.is_file() and bool({".csv", ".txt", ".tsv"} & {*file.suffixes})
+def _texts(folder: Path) -> dict[Path, str]:
+    """The texts of a folder that may be tables, by file."""
+    texts = {}
+    for file in sorted(folder.iterdir()):
+        if file.is_file() and {".csv", ".txt", ".tsv"} & {*file.suffixes}:
+            with suppress(NotTextError):
+                texts[file] = read_text(file)
+    return texts
 
 
 def _first_line(text: str) -> tuple[int, str]:
@@ -242,8 +250,16 @@ def _read(file: Path, text: str) -> ColumnFile:
     return ColumnFile(file, columns, rows)
 
 
-def _is_motion(table: ColumnFile) -> bool:
-    return {"x", "y"} <= table.quantities or {"speed", "rate"} <= table.quantities or {"turn"} <= table.quantities
+def _is_other_table(text: str) -> bool:
+    """Whether the header of a text is that of odometry, a truth or a survey: other files of the folder are not read."""
+    quantities = {column.quantity for column in _header(text) if column}
+    if is_events_csv(text):
+        return False
+    return _is_motion(quantities) if "time" in quantities else {"beacon", "x", "y"} <= quantities
+
+
+def _is_motion(quantities: set[str]) -> bool:
+    return {"x", "y"} <= quantities or {"speed", "rate"} <= quantities or {"turn"} <= quantities
 
 
 def _readings(table: ColumnFile, numbers: dict[str, float]) -> Iterator[tuple[str, int, list[float]]]:

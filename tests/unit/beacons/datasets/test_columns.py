@@ -95,6 +95,14 @@ def test_the_same_run_comes_from_tables_and_from_a_graph(make: Callable[[Path], 
     assert found.kind == "csv"
 
 
+def test_other_files_of_the_folder_are_not_read(tmp_path: Path) -> None:
+    write_lines(tmp_path / "events.csv", csv_lines(W))
+    write_lines(tmp_path / "notes.csv", ["time,note", "1,windy, and cold"])
+    write_lines(tmp_path / "list.txt", ["id,owner", "6,Ann, Bob"])
+    (tmp_path / "image.txt").write_bytes(bytes(range(256)))
+    assert read_run(long_form(tmp_path), None, None).beacon_truth_m == BEACONS
+
+
 def rewritten(folder: Path, *lines: str) -> Path:
     """The table of readings with other lines."""
     return write_lines(folder / "uwb.csv", [*lines])
