@@ -23,10 +23,14 @@ class Part:
 
     place: str
 
+    @property
+    def name(self) -> str:
+        """Its name in its module."""
+        return self.place.partition(":")[2]
+
     def get(self) -> Any:
         """Import it."""
-        module, _, name = self.place.partition(":")
-        return getattr(import_module(module), name)
+        return getattr(import_module(self.place.partition(":")[0]), self.name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

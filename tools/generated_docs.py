@@ -165,7 +165,10 @@ def commands() -> str:
 
 
 def _commands(group: click.Group, path: tuple[str, ...]) -> Iterator[str]:
-    for name, command in sorted(group.commands.items()):
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None
         own = (*path, name)
         if isinstance(command, click.Group):
             yield from _commands(command, own)

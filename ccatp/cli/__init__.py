@@ -1,6 +1,6 @@
 """The table of commands. Only click is imported here, because ``--help`` and completion must be fast.
 
-Each module has the commands of one purpose; ``common`` has their shared parts.
+Each module has the commands of one purpose and is imported when one of them is used; ``common`` has their shared parts.
 """
 
 import gc
@@ -9,22 +9,34 @@ from collections.abc import Sequence
 import click
 
 import ccatp
-from ccatp.cli import config, onboard, operate, prepare, recording, report, run, runs, sim, study
 from ccatp.cli.common import CommandGroup, example, run_command_line
-from ccatp.missions import built_in
+from ccatp.missions import Part, built_in
 
+
+def _commands(module: str, *names: str) -> tuple[Part, ...]:
+    return tuple(Part(f"ccatp.cli.{module}:{name}") for name in names)
+
+
+# Titles in the help, and the commands below them; each has the name of its function.
 SECTIONS = {
-    "Before a mission": (prepare.plan, prepare.check, prepare.calibrate, config.config, config.keys),
+    "Before a mission": (*_commands("prepare", "plan", "check", "calibrate"), *_commands("config", "config", "keys")),
     "Operate": (
-        *(run.run, operate.status, operate.alarms, operate.pause, operate.resume, operate.abort, operate.stop),
-        *(operate.emergency, operate.clear, run.dashboard, run.stream),
+        *_commands("run", "run"),
+        *_commands("operate", "status", "alarms", "pause", "resume", "abort", "stop", "emergency", "clear"),
+        *_commands("run", "dashboard", "stream"),
     ),
     "Data": (
-        *(runs.runs, report.report, report.compare, report.align, report.replay, report.plot, recording.recording),
+        *_commands("runs", "runs"),
+        *_commands("report", "report", "compare", "align", "replay", "plot"),
+        *_commands("recording", "recording"),
     ),
-    "Simulation and robots": (sim.sim, onboard.onboard, sim.conformance),
-    "Studies": (study.study, study.bench, *(part.get() for kind in built_in() for part in kind.commands)),
-    "Shell": (config.completion,),
+    "Simulation and robots": (
+        *_commands("sim", "sim"),
+        *_commands("onboard", "onboard"),
+        *_commands("sim", "conformance"),
+    ),
+    "Studies": (*_commands("study", "study", "bench"), *(part for kind in built_in() for part in kind.commands)),
+    "Shell": _commands("config", "completion"),
 }
 
 

@@ -20,6 +20,7 @@ from click.shell_completion import CompletionItem
 
 from ccatp.config.package import configs_dir
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, one_line, printable
+from ccatp.missions import Part
 
 Command = Callable[..., Any]
 _NOT_WRITTEN = (errno.ENOSPC, errno.EIO, errno.EBADF)  # full device, closed terminal, read-only stream
@@ -108,20 +109,31 @@ _errors_as_json = False
 class CommandGroup(click.Group):
     """A group of commands that refuses the former name of a command with a message of its present name.
 
-    ``sections``: titles in the help and the commands below them, in this order; without it there is one title.
+    ``sections``: titles in the help and the places of the commands below them, in this order; a command is imported
+    when it is used. Without them there is one title.
     """
 
-    def __init__(
-        self, *args: Any, sections: Mapping[str, Sequence[click.Command]] | None = None, **kwargs: Any
-    ) -> None:
+    def __init__(self, *args: Any, sections: Mapping[str, Sequence[Part]] | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.sections = sections or {}
-        for command in (one for commands in self.sections.values() for one in commands):
-            self.add_command(command)
+        self.sections = {title: {part.name: part for part in parts} for title, parts in (sections or {}).items()}
+        self._parts = {name: part for parts in self.sections.values() for name, part in parts.items()}
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """As ``click.Group.list_commands``."""
+        return sorted({*super().list_commands(ctx), *self._parts})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """As ``click.Group.get_command``."""
+        if cmd_name in self._parts:
+            command: click.Command = self._parts[cmd_name].get()
+            return command
+        return super().get_command(ctx, cmd_name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the complete first sentence of each command's help; click shortens it."""
-        for title, commands in (self.sections or {"Commands": [*self.commands.values()]}).items():
+        sections: Mapping[str, Iterable[str]] = self.sections or {"Commands": self.commands}
+        for title, names in sections.items():
+            commands = [command for name in names if (command := self.get_command(ctx, name)) is not None]
             texts = [" ".join((command.help or "").split()) for command in commands]
             firsts = [re.split(r"(?<=[.:;])\s", text, maxsplit=1)[0].rstrip(".:;") for text in texts]
             with formatter.section(title):
@@ -131,8 +143,8 @@ class CommandGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """As ``click.Group.resolve_command``."""
-        name, new_name = args[0], RENAMED_COMMANDS.get(args[0])
-        if name not in self.commands and new_name in self.commands:
+        name, new_name, known = args[0], RENAMED_COMMANDS.get(args[0]), self.list_commands(ctx)
+        if name not in known and new_name in known:
             raise click.UsageError(f"the command {name!r} is now called {new_name!r}", ctx)
         return super().resolve_command(ctx, args)
 

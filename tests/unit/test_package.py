@@ -225,8 +225,8 @@ def test_panels_do_not_overlap() -> None:
 def test_the_commands_of_the_containers_are_commands(name: str) -> None:
     arguments: list[str] = COMPOSE["services"][name]["command"]
     command: Any = cli
-    while arguments and arguments[0] in getattr(command, "commands", {}):
-        command, arguments = command.commands[arguments[0]], arguments[1:]
+    while isinstance(command, click.Group) and arguments:
+        command, arguments = command.get_command(click.Context(command), arguments[0]), arguments[1:]
     known = {option for parameter in command.params for option in parameter.opts}
     given = [argument for argument in arguments if argument.startswith("--")]
     assert given
