@@ -189,7 +189,9 @@ def turn_text(status: MissionStatus) -> TurnText:
 
 def is_under_way(status: MissionStatus) -> bool:
     """Whether the mission makes progress, so that its remaining time means something."""
-    return not status.outcome and status.exit_status < 0 and (not status.turn.kind or status.turn.kind in MOVING)
+    kind = status.turn.kind
+    is_going_home = kind == Kind.HOME and status.eta_s <= 0.0  # the remaining points are given up
+    return not status.outcome and status.exit_status < 0 and (not kind or kind in MOVING) and not is_going_home
 
 
 def _does(status: MissionStatus, turn: Turn) -> str:
@@ -209,9 +211,11 @@ def _hands(cause: Cause) -> str:
 
 def _then(turn: Turn) -> str:
     hands, action = _hands(turn.bars or turn.why), Next(turn.next)
+    is_emergency = turn.why.condition in (EARTHQUAKE.name, EMERGENCY.name)
     match action:
         case Next.HANDS if turn.kind == Kind.OVER:
-            return f"{hands}; {_THEN[Next.RESUME_RUN]}"
+            held = f"'ccatp run --resume --start-held', then {hands}, then resume"  # another run would go home again
+            return held if is_emergency else f"{hands}; {_THEN[Next.RESUME_RUN]}"
         case Next.HANDS if turn.bars:
             what = "until this has ended" if turn.bars == turn.why else f"while this lasts: {text_of(turn.bars)}"
             return f"{hands or 'wait'}; resume is refused {what}"
@@ -220,8 +224,9 @@ def _then(turn: Turn) -> str:
         case Next.RESUME if hands and turn.kind == Kind.FAULTED:
             return f"{hands}, then resume"
         case Next.CLEAR:
-            is_emergency = turn.why.condition in (EARTHQUAKE.name, EMERGENCY.name)
             return hands if is_emergency else "clear the emergency; then resume"
+        case Next.GO_ON if turn.kind == Kind.HOME:
+            return "drives to its base, where the run ends"
         case Next.GO_ON | Next.WAIT if turn.kind == Kind.READY:
             return _BEGINS[action if turn.why else Next.GO_ON]
     return _THEN[action]

@@ -13,7 +13,7 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.records.checkpoint import AT_BASE, CHECKPOINT_FILE, CheckpointError, read_checkpoint
 from ccatp.records.store import MissionStore, StoreError, planned_point
 from ccatp.survey.composition import Checkpoint, SurveyParts, assemble, take_over
-from ccatp.survey.events import EmergencyKnown, Pause, TakenOver
+from ccatp.survey.events import EmergencyKnown, Pause, SurveyOutcome, TakenOver
 from ccatp.survey.planning.route import ORDERS
 
 
@@ -46,11 +46,12 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
         parts = take_over(cfg, checkpoint, TakenOver(measured, is_new_run=True))
     if args.is_held and not parts.mission.state.is_held_by_hand:
         before = ""
-        if checkpoint is None:
+        # A robot at base is not sent there again: it stands until the emergency is cleared and an operator resumes.
+        if checkpoint is None or checkpoint.state.outcome is SurveyOutcome.AT_BASE:
             parts.mission.handle(EmergencyKnown())
             latched = [f"'ccatp clear {one}'" for one in active_ids(args.run_dir / EMERGENCIES_FILE)]
             if latched:
-                before = f"the last run ended with an emergency that is not cleared: {', '.join(latched)}; "
+                before = f"the last run ended with an emergency: {', '.join(latched)} when its cause is gone; "
         parts.mission.handle(Pause(_why_held(before, points, measured, skipped)))
     return parts, store
 

@@ -208,6 +208,10 @@ def test_one_line() -> None:
     held = {**STATUS, "state": "held", "turn": {**paused, "why": {"condition": "operator", "values": {"by": "eva"}}}}
     assert status_line(held).endswith(" 12:34 elapsed: paused by eva. Next: an operator: resume")
     assert "remaining" not in dict(status_rows(held))["time"]
+    home = {**STATUS, "state": "returning", "eta_s": 0.0, "turn": {**drives, "kind": "home"}}
+    assert status_line(home).endswith(
+        " 12:34 elapsed: driving home. Next: the robot drives to its base, where the run ends"
+    )
     assert status_line({}).startswith("0 %: 0 of 0 points")
     assert [clock(s) for s in (-1.0, 0.4, 59.6, 3600.0)] == ["0:00", "0:00", "1:00", "1:00:00"]
 

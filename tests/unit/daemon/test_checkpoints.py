@@ -20,6 +20,7 @@ from ccatp.config.models import Config
 from ccatp.core import Cause, DeckPose, EventCode, Fix, PointId, Verdict
 from ccatp.daemon.loops.checkpoint_writer import CheckpointWriter
 from ccatp.daemon.loops.checkpoints import StoreUnusable, build_parts
+from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE
 from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.daemon.supervision.run_dir import keep_origin
 from ccatp.errors import ConfigError
@@ -31,7 +32,7 @@ from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import MissionCommand, Settling
 from ccatp.survey.budget import BudgetProgress, TimeBudget
 from ccatp.survey.composition import Checkpoint, SurveyParts
-from ccatp.survey.engagement import Held, Levels
+from ccatp.survey.engagement import Held, Levels, Over
 from ccatp.survey.events import (
     Abort,
     Fault,
@@ -306,6 +307,28 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     assert (state.mode, text_of(state.cause), state.is_faulted) == (Mode.HELD, "a wheel is blocked", False)
     assert (state.done, state.skipped, state.failure_causes, state.budget.before_s) == ((one,), (), {}, 0.0)
     assert len({stop.point for stop in state.route.stops} - {None}) == 8
+
+
+@pytest.mark.parametrize("outcome", [SurveyOutcome.AT_BASE, SurveyOutcome.STOPPED])
+def test_a_robot_that_an_emergency_sent_to_its_base_stands_there_until_it_is_cleared(
+    tmp_path: Path, outcome: SurveyOutcome
+) -> None:
+    where = args(load_config(None, {"run.panels": 1}), tmp_path)
+    built, store = build(where)
+    over = structs.replace(built.mission.state, phase=Over(outcome), emergency_epoch=1)
+    writer = CheckpointWriter(tmp_path, built.localizer, Mission(built.mission.survey, over), is_patient=True)
+    writer.write(3, 0.03, 12.5)
+    writer.close()
+    store.close()
+    (tmp_path / EMERGENCIES_FILE).write_text('{"active": [{"id": "of-fire", "kind": "fire", "note": ""}]}')
+    again, store = build(replace(where, is_resuming=True, is_held=True))
+    store.close()
+    state = again.mission.state
+    at_base = outcome is SurveyOutcome.AT_BASE
+    assert state.is_held_by_hand
+    assert (state.emergency_epoch is None) == at_base
+    expected = "the last run ended with an emergency: 'ccatp clear of-fire' when its cause is gone; "
+    assert text_of(state.cause).startswith(expected) == at_base
 
 
 @pytest.mark.fault("P24")

@@ -99,8 +99,8 @@ def test_in_every_state_one_acts_and_only_what_would_be_accepted_is_offered() ->
         (Engagement(Over(SurveyOutcome.AT_BASE), cause=CALLED), None, (),
          "returned to base; by eva. Next: an operator: 'ccatp run --resume' measures the remaining points"),
         (Engagement(Over(SurveyOutcome.AT_BASE), cause=EMERGENCY.cause(kind="fire")), None, (),
-         "returned to base; by the observatory, emergency: fire. Next: the observatory: clear the emergency when its "
-         "cause is gone; 'ccatp run --resume' measures the remaining points"),
+         "returned to base; by the observatory, emergency: fire. Next: the observatory: 'ccatp run --resume "
+         "--start-held', then clear the emergency when its cause is gone, then resume"),
     ],
 )  # fmt: skip
 def test_the_line(s: Engagement, verdict: Verdict | None, offers: tuple[str, ...], line: str) -> None:
