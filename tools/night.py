@@ -97,7 +97,14 @@ class Night:
 
         run.until(is_there, timeout_s)
         self.note(f"alarm {found[0]['name']}: {found[0]['severity']}, {found[0]['cause']}")
+        self.note_status()
         return found[0]
+
+    def note_status(self) -> None:
+        """The first line of ``ccatp status``: what the robot does, and who acts next."""
+        self.note(
+            f"status: {ccatp('status', '--runtime-dir', self.sockets).splitlines()[0].removeprefix('now').strip()}"
+        )
 
     def resume(self, run: Run) -> None:
         """As soon as the daemon waits for it, until the robot drives."""
@@ -149,10 +156,12 @@ def spend(night: Night) -> None:
         night.acknowledge(night.await_alarm(run, "weather"))
         status = run.wait(300.0)
         night.note(f"the robot is at base, the daemon ended with {status}")
-    with night.session(BATTERY.format(battery_s=35.0), "--resume") as run:
-        run.until_state("idle", "held", "driving", "turning")
+    with night.session(BATTERY.format(battery_s=35.0), "--resume", "--start-held") as run:
+        run.until_state("held")
+        night.note_status()
         ccatp("clear", found["id"], "--runtime-dir", night.sockets)
         night.note("the wind is gone: cleared")
+        night.resume(run)
         night.acknowledge(night.await_alarm(run, "battery"))
         night.note(f"the robot is at base, the daemon ended with {run.wait(300.0)}")
     with night.session("", "--resume") as run:
