@@ -146,6 +146,9 @@ class CommandGroup(click.Group):
         name, new_name, known = args[0], RENAMED_COMMANDS.get(args[0]), self.list_commands(ctx)
         if name not in known and new_name in known:
             raise click.UsageError(f"the command {name!r} is now called {new_name!r}", ctx)
+        if name not in known:
+            for part in self._parts.values():  # click proposes what it has
+                self.add_command(part.get())
         return super().resolve_command(ctx, args)
 
 

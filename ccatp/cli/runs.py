@@ -134,8 +134,7 @@ def remove_runs(
 def _facts(run_dir: Path) -> dict[str, Any]:
     """The facts of one run; an unknown value is an empty text."""
     from ccatp.config.messages import parse_toml
-    from ccatp.links.runtime_dir import is_held
-    from ccatp.records.recorder import RUN_LOCK
+    from ccatp.links.runtime_dir import RUN_LOCK, is_held
 
     events = list(_events(run_dir / "log.jsonl"))
     begun = next((event for event in events if event.get("event") == "run_started"), {})

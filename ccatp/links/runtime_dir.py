@@ -12,6 +12,7 @@ from pathlib import Path
 from ccatp.errors import ConfigError, RefusedError
 
 LOCK_FILE = "lock"
+RUN_LOCK = ".lock"  # in a run directory; held by the daemon that writes there
 # Held by the simulated robot that publishes its truth there.
 TRUTH_LOCK_FILE = "truth.lock"
 # Folders in the usual folder: each of a simulation that began while another daemon ran.

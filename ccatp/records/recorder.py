@@ -28,10 +28,9 @@ from zstandard import ZstdError
 from ccatp.core import Verdict
 from ccatp.links import topics
 from ccatp.links.bus import unpack
-from ccatp.links.runtime_dir import is_held
+from ccatp.links.runtime_dir import RUN_LOCK, is_held
 
 TELEMETRY = "telemetry.mcap"
-RUN_LOCK = ".lock"  # in a run directory; held by the daemon that writes there
 CHUNK_BYTES = 16 * 1024
 FLUSH_AFTER_S = 1.0  # of message time: so long a slow topic waits for a full chunk
 HELD_BACK_S = 0.25  # of the machine's time: so long any message waits

@@ -18,6 +18,9 @@ class RunRecord(ABC):
         """Warnings for the operator at the end."""
         return ()
 
+    def prepare(self) -> None:  # noqa: B027 - most need nothing
+        """Import what only ``build`` needs, while the robot drives."""
+
     @abstractmethod
     def take(self, message: Message) -> None:
         """Take one message of the run."""

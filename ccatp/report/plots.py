@@ -140,10 +140,19 @@ def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
         if path.suffix.lower() == ".svg":
             path.write_text(svg_of(figure, is_file=True) + "\n", encoding="utf-8")
         else:
+            arrange(figure)
             figure.savefig(path, dpi=dpi or "figure", metadata=undated.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise PictureError(f"{path}: cannot be written: {why}") from error
+
+
+def arrange(figure: "Figure") -> None:
+    """Give every part of a complete figure its place, once: saving would draw all of it a second time to do so."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
 
 
 def svg_of(figure: "Figure", *, is_file: bool = False) -> str:
@@ -153,6 +162,7 @@ def svg_of(figure: "Figure", *, is_file: bool = False) -> str:
     """
     from matplotlib import rc_context  # noqa: PLC0415
 
+    arrange(figure)
     title = str(figure.get_label())
     salt = f"{title} {figure.get_figwidth():g}"
     text = StringIO()

@@ -15,7 +15,7 @@ from ccatp.records.run_reader import RunReadError
 from ccatp.report import figures
 from ccatp.report.alignment import worst_corner
 from ccatp.report.findings import Findings, Grade, coverage_of, findings_of, observation_of
-from ccatp.report.html import MICRO, Draw, RunReport, events_of, page_figures, render, write_pictures
+from ccatp.report.html import MICRO, Draw, RunReport, environment, events_of, page_figures, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure
 from ccatp.report.network import air_text, network_data, sentence, undetermined_text
 from ccatp.report.plots import check_drawing
@@ -24,6 +24,7 @@ from ccatp.report.tables import write_tables
 
 REPORT = "report.html"
 PAGE_MODE = 0o644
+_PAGE = environment().get_template("run.html")  # compiled here: while the robot drives, if a run draws its report
 _FEW = 12  # panels of a table; a longer table is folded
 
 
@@ -67,8 +68,7 @@ def run_page(found: Findings) -> str:
         (panel, mirror_wavefront([panel.rigid.wavefront]), worst_corner(record.mirror, panel), _remarks(panel))
         for panel in fitted
     ]
-    return render(
-        "run.html",
+    return _PAGE.render(
         found=found,
         record=record,
         alignment=found.alignment,

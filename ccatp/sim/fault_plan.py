@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
-from pydantic import Field, ValidationError, create_model
+from pydantic import ConfigDict, Field, ValidationError, create_model
 
 from ccatp.config.files import read_toml
 from ccatp.config.messages import choice_hint, faults_of, find_line, format_key, format_value, nearest, parse_toml
@@ -54,6 +54,8 @@ SENSOR_CLOCKS = {"imu_clock": "imu", "encoder_clock": "enc", "edge_clock": "edge
 
 class InjectedFault(Model):
     """A fault of the simulated robot; ``at_s`` is robot time since the first boot."""
+
+    model_config = ConfigDict(defer_build=True)  # most runs have no plan, and each start imports this
 
     signal: str
     type: str

@@ -21,7 +21,7 @@ from ccatp.daemon.supervision.supervisor import PROCESSES
 from ccatp.links.topics import TOPICS
 from ccatp.records.recorder import iter_messages
 from tests.processes.conftest import Start
-from tests.support.runs import DEADLINE_S, NO_CALIBRATION, NO_REPORT, RecordedRun, Run
+from tests.support.runs import DEADLINE_S, NO_CALIBRATION, NO_REPORT, RecordedRun, Run, until
 
 FIRE = {"channel": "emergency", "kind": "fire", "id": "8c0e5f9e-6a1f-4b8e-9a51-0d5b2f4f2f10"}
 SOUND = {"true_edges": 0, "false_edges": 0, "falls": 0, "max_overrun_mm": 0.0}
@@ -152,9 +152,7 @@ def test_two_simulations_from_one_directory_have_their_own_processes_and_two_int
         assert [run.poll() for run in runs] == [None, None]
         time.sleep(0.05)
     for run in runs:
-        children = [" ".join(child.cmdline()) for child in psutil.Process(run.pid).children()]
-        modules = re.findall(r"ccatp\.daemon\.\w+\.(\w+)", " ".join(children))
-        assert sorted(modules) == ["danger_loop", "dashboard", "fork_server", "main_loop", "sim_etalon", "sim_robot"]
+        until(lambda pid=run.pid: modules_of(pid) == PROCESSES_OF_A_RUN)  # type: ignore[misc]
         run.send_signal(signal.SIGINT)
         run.send_signal(signal.SIGINT)
     reports = set()
@@ -169,6 +167,17 @@ def test_two_simulations_from_one_directory_have_their_own_processes_and_two_int
         summary = json.loads((path / "summary.json").read_text())
         assert summary["points"]["measured"] == measured_in(path / "mission.sqlite") >= 1
     assert len(list(folders.iterdir())) == 2
+
+
+PROCESSES_OF_A_RUN = [
+    *("danger_loop", "dashboard", "fork_server", "main_loop", "report_process", "sim_etalon", "sim_robot")
+]
+
+
+def modules_of(pid: int) -> list[str]:
+    """The modules that the children of a process run."""
+    children = [" ".join(child.cmdline()) for child in psutil.Process(pid).children()]
+    return sorted(re.findall(r"ccatp\.daemon\.\w+\.(\w+)", " ".join(children)))
 
 
 def measured_in(database: Path) -> int:
@@ -353,7 +362,9 @@ import click, json, sys
 from ccatp.cli import cli, main
 def paths(group, path=()):
     yield path
-    for name, command in group.commands.items():
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
         yield from paths(command, (*path, name)) if isinstance(command, click.Group) else [(*path, name)]
 status = max(main([*path, "--help"]) for path in paths(cli))
 print(json.dumps([status, [name for name in {HEAVY!r} if name in sys.modules]]))

@@ -1,19 +1,13 @@
-"""The terminal output of a run: progress, messages, summary, status table; and the report at its end."""
+"""The terminal output of a run: progress, messages, summary, status table."""
 
 import json
 import os
-import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from importlib import import_module
-from pathlib import Path
-from threading import Thread
 from typing import Any, Self
 
 import msgspec
-import structlog
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -21,19 +15,15 @@ from ccatp.conditions import danger_text, find_condition
 from ccatp.core import Severity
 from ccatp.daemon.supervision.process import RunContext
 from ccatp.daemon.supervision.run_text import RunText, clock
-from ccatp.errors import ExitStatus, printable
+from ccatp.errors import printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
-from ccatp.missions import MissionKind, kind_of
+from ccatp.missions import kind_of
 from ccatp.records.summary import format_table
 from ccatp.survey.ending import ending_text, read_ending
 from ccatp.survey.turn import is_under_way, turn_text
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
-# What draws the figures of a report; its own modules import it where they draw.
-DRAWING = ("ccatp.report.run_page", "matplotlib.figure", "matplotlib.backends.backend_svg")
-# Signals that end a run, or the writing of its report.
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
 
 
@@ -159,57 +149,6 @@ class RunView:
         """Show where the report is, or why there is none; on standard error, to keep standard output pure JSON."""
         if not self._is_quiet:
             self._console.print(printable(f"report  {where}"), soft_wrap=True, markup=False)
-
-
-def import_drawing(kind: MissionKind) -> Thread | None:
-    """Begin to import what draws the report of a kind of mission; ``None``: it has no report.
-
-    For a run in lockstep, in which no frame can be late: the second that it takes passes while the robot drives.
-    """
-    part = kind.report
-    if part is None:
-        return None
-
-    def load() -> None:
-        with suppress(Exception):  # the report itself says what is missing
-            for module in DRAWING:
-                import_module(module)
-            part.get()
-
-    thread = Thread(target=load, name="import of the report", daemon=True)
-    thread.start()
-    return thread
-
-
-def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.FilteringBoundLogger) -> str:
-    """Write the report of a run that has ended; returns where it is, or why there is none.
-
-    An interrupted run gets none, because the operator waits for the end. A signal only ends the writing; the status of
-    the run does not change.
-    """
-    by_hand = f"none; make it with: ccatp report {run_dir}"
-    if status is ExitStatus.INTERRUPTED:
-        return by_hand
-    # Imported late: not needed while the robot moves.
-    from ccatp.records.run_reader import RunReadError  # noqa: PLC0415
-
-    previous = {n: signal.signal(n, signal.default_int_handler) for n in STOP_SIGNALS}
-    try:
-        from ccatp.report.run_page import report_run  # noqa: PLC0415
-
-        data, _ = report_run(run_dir)
-        return str(data["report"])
-    except KeyboardInterrupt:
-        return by_hand
-    except RunReadError as error:
-        return f"none; {error}"
-    except Exception as error:
-        # The survey has ended, and its record is on the disk.
-        log.error("report_failed", error=f"{type(error).__name__}: {error}")
-        return by_hand
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 CODES = {0: "normal", 1: "near the mirror's edge", 2: "operation aborted"}

@@ -77,6 +77,10 @@ class Collector:
         """Warnings for the operator at the end."""
         return self._record.remarks
 
+    def prepare(self) -> None:
+        """Import what only the summary needs."""
+        self._record.prepare()
+
     def finish(self) -> None:
         """Request the last rows of the simulated truth, and wait for the messages that are still on their way."""
         if self._run.is_sim:

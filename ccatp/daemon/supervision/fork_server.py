@@ -23,13 +23,17 @@ from ccatp.config.package import child_environment
 from ccatp.links.service_manager import VARIABLES
 
 MODULE = "ccatp.daemon.supervision.fork_server"
-# What every process of every mission imports; nothing of a mission, nothing that the danger rules must not import, and
-# no state of random numbers but that of ``random``, which a fork seeds again.
-PRELOADED = ("ccatp.daemon.supervision.process", "ccatp.links.topics", "numpy", "uvloop", "zmq.asyncio")
+# What every process of every mission imports; nothing of a mission, nothing that the danger rules must not import.
+# SciPy is for the main loop alone, and its longest import: here it takes place beside the imports of the supervisor.
+PRELOADED = (
+    "ccatp.daemon.supervision.process", "ccatp.links.topics", "numpy", "uvloop", "zmq.asyncio",
+    "scipy.linalg", "scipy.special",
+)  # fmt: skip
 # Environment variable with the supervisor's process number, for its children.
 SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
-# The matrices are 4 x 4: threads of the linear algebra would only compete with the processes for the cores.
-ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+# The matrices are 4 x 4: threads of the linear algebra would only compete with the processes for the cores. And nothing
+# is searched in all installed packages for plugins of the configuration's models.
+ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYDANTIC_DISABLE_PLUGINS": "__all__"}
 # Until the first process is forked the server imports; a fork takes milliseconds.
 FIRST_TIMEOUT_S, TIMEOUT_S = 20.0, 2.0
 # Longest pause between two looks for the end of a process.
@@ -207,7 +211,6 @@ def main() -> None:
     control = socket.socket(fileno=int(sys.argv[1]))
     for name in PRELOADED:
         importlib.import_module(name)
-    gc.collect()
     gc.freeze()  # the pages of what is there stay shared, and no collection visits it
     with control:
         request = _serve(control)
@@ -248,6 +251,8 @@ def _become(request: Request) -> None:
             answer = handshake.recv(64)
     if answer != _GO:
         os._exit(1)
+    if (random := sys.modules.get("numpy.random")) is not None:
+        random.seed()  # Python seeds only its own generator again
     os.setsid()
     _place(request.received, request.wanted)
     sys.argv = ["", *request.arguments]

@@ -30,6 +30,8 @@ from ccatp.daemon.supervision.fork_server import SUPERVISOR_PID
 from ccatp.errors import CcatpError
 
 PR_SET_PDEATHSIG = 1
+# Signals that end a run, or the writing of its report.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 BACKLOG = 64  # of listening sockets
 # Copy of the fault plan in the run directory.
 FAULTS_FILE = "faults.toml"

@@ -17,9 +17,17 @@ from ccatp.config.mission import CommonConfig
 from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE
 from ccatp.daemon.supervision.run_text import RunText
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError
-from ccatp.links.runtime_dir import BESIDE, LOCK_FILE, TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
+from ccatp.links.runtime_dir import (
+    BESIDE,
+    LOCK_FILE,
+    RUN_LOCK,
+    TRUTH_LOCK_FILE,
+    is_held,
+    locked,
+    make_runtime_dir,
+    remove_sockets,
+)
 from ccatp.missions import MissionKind, kind_of
-from ccatp.records.recorder import TELEMETRY, read_metadata
 
 UNFINISHED_FILE = Path("runs") / "unfinished"
 # Emergencies that were active when a run finished, for the next run, because without a daemon nobody can clear them.
@@ -239,7 +247,10 @@ def _began_simulated(run_dir: Path) -> bool | None:
     """Whether a run began in simulation; ``None`` if that is not known."""
     if (is_sim := _read_origin(run_dir).get("simulation")) is not None:
         return bool(is_sim)
-    try:  # a run of an older version: its recording has it, too
+    # A run of an older version: its recording has it, too. Its readers take a tenth of the time of a start to import.
+    from ccatp.records.recorder import TELEMETRY, read_metadata  # noqa: PLC0415
+
+    try:
         simulation = read_metadata(run_dir / TELEMETRY).get("simulation")
     except (OSError, CcatpError):
         return None
@@ -294,6 +305,8 @@ def make_run_dir(options: RunOptions, cfg: CommonConfig) -> Path:
     run_dir = options.run_dir or _make_new(default_run_dir(_folder_of(cfg), cfg.run.seed, datetime.now(UTC)))
     has_mission = (run_dir / "mission.sqlite").exists()
     if has_mission and not options.resume:
+        if is_held(run_dir / RUN_LOCK):
+            raise ConfigError(f"--run-dir: another ccatp runs in {run_dir}; name another folder")
         advice = "give --resume to continue it, or another folder" if kind.no_resume is None else "name another folder"
         raise ConfigError(f"--run-dir: {run_dir} holds a mission already; {advice}")
     if options.resume and not has_mission:

@@ -8,8 +8,8 @@ from pathlib import Path
 from ccatp.config.load import kind_in
 from ccatp.daemon.supervision.run_dir import CHILDREN_LOCK, ORIGIN_FILE, finished_summary
 from ccatp.errors import ConfigError, RefusedError
-from ccatp.links.runtime_dir import is_held, locked
-from ccatp.records.recorder import RUN_LOCK, TELEMETRY
+from ccatp.links.runtime_dir import RUN_LOCK, is_held, locked
+from ccatp.records.recorder import TELEMETRY
 from ccatp.records.run_reader import CONFIG, STORE
 
 DAY_S = 86_400.0

@@ -7,10 +7,10 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from functools import partial
+from contextlib import ExitStack, suppress
+from functools import cached_property, partial
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import zmq
@@ -19,7 +19,7 @@ from ccatp.config.files import read_toml, write_durably
 from ccatp.config.load import dump_config, load_config, load_mission
 from ccatp.config.mission import CommonConfig
 from ccatp.daemon.operator.alarms import AlarmList
-from ccatp.daemon.operator.terminal import STOP_SIGNALS, RunView, import_drawing, write_run_report
+from ccatp.daemon.operator.report_process import ReportProcess, by_hand
 from ccatp.daemon.operator.webhook import AlarmWebhook
 from ccatp.daemon.supervision.child_processes import (
     PageSocket,
@@ -33,7 +33,6 @@ from ccatp.daemon.supervision.child_processes import (
     token_query,
     with_addresses,
 )
-from ccatp.daemon.supervision.collector import Collector
 from ccatp.daemon.supervision.fork_server import ChildProcess, ForkServer, start_module
 from ccatp.daemon.supervision.named_files import check_named_files
 from ccatp.daemon.supervision.open_files import permit_open_files
@@ -41,6 +40,7 @@ from ccatp.daemon.supervision.process import (
     ADDRESSES_FILE,
     FAULTS_FILE,
     RUN_DIR_FILE,
+    STOP_SIGNALS,
     Endpoints,
     RunContext,
     open_log,
@@ -60,12 +60,15 @@ from ccatp.daemon.supervision.run_dir import (
 from ccatp.daemon.supervision.run_text import RunText
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.liveness import STALE_AFTER_S, Liveness
+from ccatp.links.runtime_dir import RUN_LOCK
 from ccatp.links.service_manager import Notifier, is_journal, take_from
 from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat, MissionStatus
 from ccatp.missions import kind_of
-from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import TOKEN_FILE, make_token
-from ccatp.survey.ending import ending_of
+
+if TYPE_CHECKING:
+    from ccatp.daemon.operator.terminal import RunView
+    from ccatp.daemon.supervision.collector import Collector
 
 # Period of the polls of messages and processes; waking up for each message would double the cost in lockstep.
 POLL_S = 0.02
@@ -176,22 +179,39 @@ class SupervisedRun:
         self._failure = ""  # the death of a process that ended the run
         self._has_begun = False
         self._service = Service(*take_from(os.environ))
+        self._report = ReportProcess(self._start, run_dir)
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
         self._webhook = AlarmWebhook(cfg.alarms, run_dir.name, self._log, AlarmList(run_dir, self._log).alarms)
-        self._view = RunView(run, options.verbosity)
+
+    @cached_property
+    def _view(self) -> "RunView":
+        """The terminal; not before the processes are started."""
+        from ccatp.daemon.operator.terminal import RunView  # noqa: PLC0415 - while they import what they need
+
+        return RunView(self._context, self._options.verbosity)
 
     def run(self) -> int:
-        """Start, watch, collect, stop; returns the exit status."""
-        cfg, is_sim, view = self._cfg, self._context.is_sim, self._view
+        """Start, watch, collect, stop, report; returns the exit status."""
+        with self._report:
+            return self._run()
+
+    def _run(self) -> int:
+        cfg, is_sim = self._cfg, self._context.is_sim
         kind = kind_of(cfg)
         text: RunText = kind.text.get()(cfg)
         self._log.info("run_started", **{kind.subject: text.subject}, seed=cfg.run.seed, sim=is_sim)
-        for line in () if kind.without_effect is None else kind.without_effect.get()(cfg):
-            self._notify_operator("warning", line)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag instead of an exception, so that no exception handler loses a signal, and no signal ends the shutdown.
         previous = {n: signal.signal(n, self._interrupt) for n in STOP_SIGNALS}
         try:
+            self._start_processes()
+            # While the processes import what they need. No message is lost: main joins when this is subscribed.
+            from ccatp.daemon.supervision.collector import Collector  # noqa: PLC0415
+            from ccatp.survey.ending import ending_of  # noqa: PLC0415
+
+            view = self._view
+            for line in () if kind.without_effect is None else kind.without_effect.get()(cfg):
+                self._notify_operator("warning", line)
             collector = Collector(context, self._context, self._on_heartbeat)
             with collector, view:
                 status = self._watch(collector)
@@ -215,7 +235,9 @@ class SupervisedRun:
         self._log.info("run_finished", status=int(status))
         if self._options.shows_summary:
             view.show_summary(summary, as_json=self._options.json_output)
-            view.show_report(write_run_report(self._run_dir, status, self._log))
+            # An interrupted run gets no report, because the operator waits for the end.
+            is_drawn = status is not ExitStatus.INTERRUPTED
+            view.show_report(self._report.write(self._log) if is_drawn else by_hand(self._run_dir))
         return int(status)
 
     def _write(self, summary: dict[str, Any]) -> None:
@@ -232,12 +254,7 @@ class SupervisedRun:
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True
 
-    def _watch(self, collector: Collector) -> ExitStatus:
-        if self._page.text:
-            self._log.log(LEVELS[self._page.level], OPERATOR_MESSAGE, text=self._page.text)
-            has_token = self._page.socket is not None and not is_journal(STDERR, os.environ)
-            token = token_query(self._cfg.dashboard, self._context.endpoints.runtime_dir) if has_token else ""
-            self._view.show_message(self._page.level, self._page.text + token)
+    def _start_processes(self) -> None:
         for process in process_table(self._cfg):
             # A process that listens runs only if it has a socket.
             if process.name in self._sockets or not process.listens:
@@ -246,6 +263,17 @@ class SupervisedRun:
             # Robot, main and danger keep both cores of a small machine busy, and recording must not interrupt them. Not
             # by niceness, because an ordinary user cannot reduce it again, and messages would pile up under load.
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+    def _show_page(self) -> None:
+        """Tell the operator where the page is, or why there is none."""
+        if self._page.text:
+            self._log.log(LEVELS[self._page.level], OPERATOR_MESSAGE, text=self._page.text)
+            has_token = self._page.socket is not None and not is_journal(STDERR, os.environ)
+            token = token_query(self._cfg.dashboard, self._context.endpoints.runtime_dir) if has_token else ""
+            self._view.show_message(self._page.level, self._page.text + token)
+
+    def _watch(self, collector: "Collector") -> ExitStatus:
+        self._show_page()
         while not self._is_interrupted:
             time.sleep(POLL_S)
             collector.collect(0, self._view, MAX_MESSAGES)
@@ -253,8 +281,8 @@ class SupervisedRun:
             # From main's first frame on, the checkpoint is of this session. A main loop restarted before begins again.
             if not self._has_begun and collector.status is not None and collector.status.seq >= 0:
                 self._has_begun = True
-                if self._options.shows_summary and not self._options.is_paced:
-                    import_drawing(kind_of(self._cfg))
+                if not self._options.is_paced:  # in lockstep no frame can be late
+                    self._prepare_end(collector)
             now_s = time.monotonic()
             self._service.update(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
             # A dead process is handled first, because the messages of the others are its consequence.
@@ -270,6 +298,13 @@ class SupervisedRun:
                 return collector.exit_status
         self._view.show_message("warning", "interrupted: holding the wheels and saving")
         return ExitStatus.INTERRUPTED
+
+    def _prepare_end(self, collector: "Collector") -> None:
+        """Let imports that only the end needs take place while the robot drives."""
+        if self._options.shows_summary and kind_of(self._cfg).report is not None:
+            with suppress(OSError):  # the end of the run tries again
+                self._report.begin()
+        collector.prepare()
 
     def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
         self._children.on_heartbeat(heartbeat)

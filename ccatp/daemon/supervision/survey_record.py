@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,10 @@ class SurveyRecord(RunRecord):
         """Warnings for the operator at the end."""
         return self._remarks
 
+    def prepare(self) -> None:
+        """As ``RunRecord.prepare``: SciPy would delay the start of each run by a fifth of a second."""
+        import_module("ccatp.mirror.panel_alignment")
+
     def take(self, message: Message) -> None:
         """Take one message of the run."""
         self._session.take(message)
@@ -144,8 +149,7 @@ class SurveyRecord(RunRecord):
             return None
 
     def _fits(self, survey: StoredSurvey) -> PanelFits:
-        # SciPy would delay the start of each run by a fifth of a second, and is used at its end only.
-        from ccatp.mirror.panel_alignment import fit_panels  # noqa: PLC0415
+        from ccatp.mirror.panel_alignment import fit_panels  # noqa: PLC0415 - see prepare
 
         return fit_panels(self.mirror, survey.fixes, self._cfg.robot.puck_height_m)
 

@@ -17,8 +17,8 @@ from ccatp.analysis.table import Table
 from ccatp.beacons.analysis import BeaconRun
 from ccatp.core import PanelId
 from ccatp.daemon.operator.alarms import ALARMS_FILE
-from ccatp.links.runtime_dir import locked
-from ccatp.records.recorder import RUN_LOCK, read_metadata
+from ccatp.links.runtime_dir import RUN_LOCK, locked
+from ccatp.records.recorder import read_metadata
 from ccatp.records.run_reader import RunReadError, open_recordings
 from tests.support.recorded import FRAMES, OFF_M, record, record_beacons
 

@@ -28,8 +28,7 @@ from ccatp.config.mission import CommonConfig
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
-from ccatp.links.runtime_dir import locked
-from ccatp.records.recorder import RUN_LOCK
+from ccatp.links.runtime_dir import RUN_LOCK, locked
 from ccatp.survey.kind import SURVEY
 from tests.support.command import answered, printed, refused
 

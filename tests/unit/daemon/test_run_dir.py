@@ -42,6 +42,7 @@ from ccatp.links.runtime_dir import (
     LOCK_FILE,
     MAX_SOCKET_NAME_BYTES,
     MAX_SOCKET_PATH_BYTES,
+    RUN_LOCK,
     TRUTH_LOCK_FILE,
     is_held,
     locked,
@@ -119,6 +120,15 @@ def test_what_missions_among_beacons_do_not_have(tmp_path: Path, fields: dict[st
 
 
 # -- the run directory ------------------------------------------------------------------------------------------------
+
+
+def test_the_directory_of_a_run_that_goes_on_is_not_offered_for_a_resume(tmp_path: Path) -> None:
+    (tmp_path / "mission.sqlite").touch()
+    with (
+        locked(tmp_path / RUN_LOCK, "taken"),
+        pytest.raises(ConfigError, match=f"another ccatp runs in {tmp_path}; name another folder"),
+    ):
+        make_run_dir(options(run_dir=tmp_path), load_config())
 
 
 @pytest.mark.parametrize(

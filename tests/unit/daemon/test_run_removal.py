@@ -9,8 +9,7 @@ import pytest
 from ccatp.cli import main
 from ccatp.daemon.supervision.run_removal import DAY_S, chosen_by_age, refusal, remove
 from ccatp.errors import RefusedError
-from ccatp.links.runtime_dir import locked
-from ccatp.records.recorder import RUN_LOCK
+from ccatp.links.runtime_dir import RUN_LOCK, locked
 
 NOW_S = 1.8e9
 

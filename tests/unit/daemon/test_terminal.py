@@ -1,7 +1,6 @@
 """Progress on the terminal, its rate limit, and the report at the end of a run."""
 
 import json
-import signal
 from pathlib import Path
 
 import pytest
@@ -9,13 +8,11 @@ from msgspec.structs import replace
 
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.daemon.loops.survey_runner import state_text
-from ccatp.daemon.operator.terminal import RunView, write_run_report
-from ccatp.daemon.supervision.process import Endpoints, RunContext, open_log
-from ccatp.errors import ExitStatus
+from ccatp.daemon.operator.terminal import RunView
+from ccatp.daemon.supervision.process import Endpoints, RunContext
 from ccatp.links.liveness import RateLimitedLog, kind_of
 from ccatp.links.topics import DangerEvent, LogMessage, MissionStatus, TrackMessage
 from ccatp.survey.events import Mode
-from tests.support.recorded import make_run, record_beacons
 from tests.support.scenario import world_of
 
 CFG, _ = world_of()
@@ -121,30 +118,6 @@ def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.Captur
 )
 def test_a_mission_that_continues_reports_it(state: Mode, cause: str, text: str) -> None:
     assert state_text(state, cause) == text
-
-
-def test_a_run_gets_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_dir = make_run(tmp_path / "run", CFG, [], [], {})
-    log, by_hand = open_log(run_dir / "log.jsonl", "supervisor"), f"none; make it with: ccatp report {run_dir}"
-    # The operator waits for the end of an interrupted one.
-    assert write_run_report(run_dir, ExitStatus.INTERRUPTED, log) == by_hand
-    assert not (run_dir / "report.html").exists()
-    for one, text in ((run_dir, "<!DOCTYPE html>"), (record_beacons(tmp_path / "beacons"), "among ZigBee beacons")):
-        assert write_run_report(one, ExitStatus.HELD, log) == str(one / "report.html")
-        assert text in (one / "report.html").read_text()
-
-    before = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr("ccatp.report.run_page.report_run", lambda _run_dir: signal.raise_signal(signal.SIGTERM))
-    assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == by_hand
-    assert signal.getsignal(signal.SIGTERM) is before
-
-    def fail(_run_dir: Path) -> None:
-        raise ZeroDivisionError("of nothing")
-
-    monkeypatch.setattr("ccatp.report.run_page.report_run", fail)
-    assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == by_hand
-    (line,) = (json.loads(text) for text in (run_dir / "log.jsonl").read_text().splitlines())
-    assert (line["event"], line["level"], line["error"]) == ("report_failed", "error", "ZeroDivisionError: of nothing")
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from ccatp.cli import main
-from ccatp.links.runtime_dir import locked
+from ccatp.links.runtime_dir import RUN_LOCK, locked
 from ccatp.records.recorder import (
     CHUNK_BYTES,
     FLUSH_AFTER_S,
     HELD_BACK_S,
-    RUN_LOCK,
     Recorder,
     RobotClock,
     damage_text,

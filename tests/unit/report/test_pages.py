@@ -4,7 +4,10 @@ import base64
 import hashlib
 import html
 import json
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -407,3 +410,42 @@ def test_refusals_and_warnings(run_dir: Path, tmp_path: Path, capsys: pytest.Cap
     reported = capsys.readouterr()
     assert reported.err.startswith("ccatp: warning: summary.json: cannot be read: ")
     assert json.loads(reported.out)["warnings"][0].startswith("summary.json: ")
+
+
+def test_two_layouts_are_drawn_beside_each_other_where_a_process_can_be_forked() -> None:
+    # A process of its own, because one with threads, as that of these tests, is not forked.
+    code = """
+import json, os
+from ccatp.report.html import beside
+
+def fail():
+    raise ZeroDivisionError(str(os.getpid()))
+
+own, other = beside(lambda: [str(os.getpid())], lambda: [str(os.getpid()), "x" * 1_000_000])
+try:
+    beside(lambda: [], fail)
+except ZeroDivisionError as error:
+    failed = str(error)
+try:
+    beside(fail, lambda: ["x" * 1_000_000])
+except ZeroDivisionError as error:
+    failed_first = str(error)
+try:
+    os.waitpid(-1, os.WNOHANG)
+    left = "a child"
+except ChildProcessError:
+    left = ""
+print(json.dumps([own, other[0], len(other[1]), failed, failed_first, left, str(os.getpid())]))
+"""
+    found: dict[str, list[Any]] = {}
+    for threads in ("1", "2"):
+        env = os.environ | {"OPENBLAS_NUM_THREADS": threads}
+        done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+        found[threads] = json.loads(done.stdout)
+        assert not done.stderr
+    *forked, own = found["1"]
+    assert forked == [[own], forked[1], 1_000_000, own, own, ""]  # what fails in the fork is reported by its parent
+    assert forked[1] != own
+    if os.cpu_count() != 1:
+        *_, own = found["2"]
+        assert found["2"] == [[own], own, 1_000_000, own, own, "", own]
