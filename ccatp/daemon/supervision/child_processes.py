@@ -90,7 +90,8 @@ class RestartPolicy:
                 restarts_s.popleft()
             if len(restarts_s) < self._limit:
                 restarts_s.append(now_s)
-                meanwhile = "wheels held meanwhile" if spec.is_needed else "the survey continues"
+                held = "wheels held meanwhile" if spec.is_loop else "measurements wait for it"
+                meanwhile = held if spec.is_needed else "the survey continues"
                 return ProcessEnd.RESTART, f"{what}: restarting it, {meanwhile}"
             what += f", more than {self._limit} times within {self._window_s:g} s"
         if not spec.is_needed:

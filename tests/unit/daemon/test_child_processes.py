@@ -53,7 +53,7 @@ pathlib.Path(sys.argv[1] + ".ready").touch()
 time.sleep(60.0)
 """
 PAGE = ProcessSpec("page", "ending_child", is_needed=False, niceness=7)
-MAIN = ProcessSpec("main", "m")
+MAIN = ProcessSpec("main", "m", is_loop=True)
 SIMULATOR = replace(MAIN, is_replaceable=False)
 RESTART, END, HELD, WITHOUT = ProcessEnd.RESTART, ProcessEnd.END, ProcessEnd.HELD, ProcessEnd.WITHOUT
 
@@ -243,6 +243,13 @@ def test_a_crash_loop_ends_and_rare_deaths_do_not() -> None:
         (MAIN, 1, "", RESTART, "main ended with status 1: restarting it, wheels held meanwhile"),
         (MAIN, -40, "", RESTART, "main was killed by signal 40: restarting it, wheels held meanwhile"),
         (MAIN, -9, "hung", RESTART, "main hung: restarting it, wheels held meanwhile"),
+        (
+            replace(MAIN, name="laser", is_loop=False),
+            -9,
+            "",
+            RESTART,
+            "laser was killed by SIGKILL: restarting it, measurements wait for it",
+        ),
         (PAGE, -9, "", RESTART, "page was killed by SIGKILL: restarting it, the survey continues"),
         (PAGE, 2, "", WITHOUT, "page ended with status 2: the survey continues without it"),
     ],
