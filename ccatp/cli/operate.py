@@ -6,15 +6,19 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
 from ccatp.cli import common
 from ccatp.errors import ConfigError, DaemonUnreachableError
+
+if TYPE_CHECKING:
+    from ccatp.daemon.supervision.run_text import RunText
 
 _JSON = common.json_option("The daemon's answer as JSON on standard output.")
 DAEMON_OPTIONS = common.options(common.CONFIG_OPTION, common.RUNTIME_DIR_OPTION, common.TIMEOUT_OPTION, _JSON)
@@ -30,15 +34,27 @@ def _ask(folder: Path | None, command: str, timeout_s: float, **fields: str) -> 
     return OperatorClient(folder, timeout_s).ask(command, **fields)
 
 
-def _print_reply(reply: Mapping[str, Any], json_output: bool, page: str = "") -> None:
-    """Print a daemon's answer; if it has a mission status, print its rows. ``page``: address of the page."""
+def _text_in(folder: Path | None) -> "RunText | None":
+    from ccatp.daemon.supervision.run_text import text_in
+    from ccatp.links.runtime_dir import runtime_dir_path
+
+    return text_in(runtime_dir_path(str(folder or ""), os.environ))
+
+
+def _print_reply(
+    reply: Mapping[str, Any], json_output: bool, page: str = "", text: "Callable[[], RunText | None]" = lambda: None
+) -> None:
+    """Print a daemon's answer; if it has a mission status, print its rows, with the words of the run.
+
+    ``page``: address of the page.
+    """
     if json_output:
         click.echo(json.dumps(reply))
         return
     from ccatp.daemon.operator.terminal import status_rows
 
     facts, status = [(name, str(value)) for name, value in reply.items() if name != "ok"], reply.get("status")
-    rows = list(status_rows(status)) if isinstance(status, Mapping) else facts
+    rows = list(status_rows(status, text())) if isinstance(status, Mapping) else facts
     rows += [("page", page)] if page else []
     common.print_lines(common.columns(rows) or ["ok"])
 
@@ -68,7 +84,7 @@ def _operator_command(name: str, help_text: str) -> click.Command:
     @DAEMON_OPTIONS
     def command(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
         folder = common.configured_folder(config_file, runtime_dir)
-        _print_reply(_ask(folder, name, timeout_s, by=_user()), json_output)
+        _print_reply(_ask(folder, name, timeout_s, by=_user()), json_output, text=partial(_text_in, folder))
 
     return command
 
@@ -227,7 +243,8 @@ def status(
             if json_output:  # whoever reads the answer gets one
                 click.echo(json.dumps({"ok": False, "error": str(error)}))
             raise
-        _print_reply(reply, json_output, page_address(runtime_dir_path(str(folder or ""), os.environ)))
+        page = page_address(runtime_dir_path(str(folder or ""), os.environ))
+        _print_reply(reply, json_output, page, text=partial(_text_in, folder))
         return
     answers = _answers(folder, timeout_s, period_s)
     if json_output:
@@ -235,9 +252,9 @@ def status(
             click.echo(json.dumps(answer))
             sys.stdout.flush()
     elif sys.stdout.isatty():
-        _watch_terminal(answers)
+        _watch_terminal(answers, partial(_text_in, folder))
     else:
-        _watch_lines(answers)
+        _watch_lines(answers, partial(_text_in, folder))
 
 
 def _answers(folder: Path | None, timeout_s: float, period_s: float) -> Iterator[dict[str, Any]]:
@@ -257,31 +274,35 @@ def _answers(folder: Path | None, timeout_s: float, period_s: float) -> Iterator
         time.sleep(period_s)
 
 
-def _watch_lines(answers: Iterator[dict[str, Any]]) -> None:
+def _watch_lines(answers: Iterator[dict[str, Any]], text_of_run: "Callable[[], RunText | None]") -> None:
     from ccatp.daemon.operator.terminal import status_line
 
+    text: RunText | None = None
     shown, shown_s = tuple[object, ...](), 0.0
     for answer in answers:
         found = answer.get("status", {})
         newest = (found.get("state"), found.get("done"), found.get("cause"))
         if newest != shown or time.monotonic() - shown_s >= QUIET_S:
             shown, shown_s = newest, time.monotonic()
-            click.echo(status_line(found))
+            text = text or text_of_run()  # after the first answer there is a run
+            click.echo(status_line(found, text))
             sys.stdout.flush()
 
 
-def _watch_terminal(answers: Iterator[dict[str, Any]]) -> None:
+def _watch_terminal(answers: Iterator[dict[str, Any]], text_of_run: "Callable[[], RunText | None]") -> None:
     from rich.live import Live
     from rich.table import Table
 
     from ccatp.daemon.operator.terminal import status_rows
 
+    text: RunText | None = None
     with Live(auto_refresh=False) as live:
         for answer in answers:
+            text = text or text_of_run()
             table = Table(box=None, show_header=False, pad_edge=False)
             table.add_column(style="bold")
             table.add_column(overflow="fold")
-            for name, value in status_rows(answer.get("status", {})):
+            for name, value in status_rows(answer.get("status", {}), text):
                 style = "red" if name in ("cause", "event code") and value not in ("", "0 normal") else ""
                 table.add_row(name, value.replace("[", "\\["), style=style)
             live.update(table, refresh=True)

@@ -189,9 +189,7 @@ def turn_text(status: MissionStatus) -> TurnText:
 
 def is_under_way(status: MissionStatus) -> bool:
     """Whether the mission makes progress, so that its remaining time means something."""
-    kind = status.turn.kind
-    is_going_home = kind == Kind.HOME and status.eta_s <= 0.0  # the remaining points are given up
-    return not status.outcome and status.exit_status < 0 and (not kind or kind in MOVING) and not is_going_home
+    return not status.outcome and status.exit_status < 0 and (not status.turn.kind or status.turn.kind in MOVING)
 
 
 def _does(status: MissionStatus, turn: Turn) -> str:

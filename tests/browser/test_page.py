@@ -227,7 +227,7 @@ async def test_a_pause_is_no_alarm_and_a_fault_is_one_in_colour_and_in_words(ope
     state = "document.querySelector('#state').dataset.level"
     operator.status = held("paused", "operator", "resume", OPERATOR.cause(by="eva"), "resume")
     await operator.until(state, "note")
-    await operator.until_text("#held", "held, the mission is held")
+    await operator.until_text("#held", "held by the mission")
     operator.status = held("held", "robot", "wait", FRAME_LATE.cause(late_ms=60.0, limit_ms=50.0))
     await operator.until(state, "warn")
     alarms = [alarm(str(k), severity) for k, severity in enumerate(("fault", "slow", "inform"))]

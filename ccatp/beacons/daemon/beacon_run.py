@@ -13,15 +13,28 @@ PROCESSES = tuple(replace(spec, is_replaceable=spec.is_replaceable and spec.name
 
 def beacon_text(cfg: RadioConfig) -> RunText:
     """The texts of a mission among beacons."""
-    what, goals = ("follow a radio", "seconds") if cfg.follow.is_active else ("visit waypoints", "waypoints")
+    is_following = cfg.follow.is_active
+    what, goals = ("follow a radio", "seconds") if is_following else ("visit waypoints", "waypoints")
 
     def title(is_sim: bool) -> str:
         seed = f", seed {cfg.run.seed}" if is_sim else ""
         return f"ccatp {'SIMULATION' if is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}"
 
-    return RunText(subject=cfg.system, title=title, goals=goals, shown=f"system {cfg.system}", progress=_progress)
+    return RunText(
+        subject=cfg.system,
+        title=title,
+        goals=goals,
+        reached="followed" if is_following else "reached",
+        shown=f"system {cfg.system}",
+        progress=_progress,
+        accuracy=_accuracy,
+    )
 
 
 def _progress(status: MissionStatus) -> str:
     state = status.state + (f" ({status.cause})" if status.cause else "")
-    return progress_text(status, state, f"position known to {0.1 * status.error_mm:.1f} cm")
+    return progress_text(status, state, " ".join(_accuracy(status)))
+
+
+def _accuracy(status: MissionStatus) -> tuple[str, str]:
+    return "position", f"known to {0.1 * status.error_mm:.1f} cm"

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from ccatp.conditions import danger_text, find_condition
 from ccatp.core import Severity
 from ccatp.daemon.supervision.process import RunContext
-from ccatp.daemon.supervision.run_text import RunText, clock
+from ccatp.daemon.supervision.run_text import RunText, arrival, clock
 from ccatp.errors import printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
@@ -166,23 +166,26 @@ def share_done(status: MissionStatus) -> float:
     return (status.done + status.skipped) / status.total if status.total else 0.0
 
 
-def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Name and value of each line of the table, from the ``status`` in the reply of the operator channel."""
+def status_rows(answered: Mapping[str, Any], text: RunText | None = None) -> list[tuple[str, str]]:
+    """Name and value of each line of the table, from the ``status`` in the reply of the operator channel.
+
+    ``text``: the texts of the run; ``None``: it is taken for a survey.
+    """
     status = _read(answered)
+    goals, reached = ("points", "measured") if text is None else (text.goals, text.reached)
+    accuracy = arrival if text is None else text.accuracy
     filled = round(BAR * share_done(status))
     skips = f", {status.skipped} skipped" if status.skipped else ""
-    bound = f"minimum {clock(status.lower_bound_s)}"
-    # The error is exactly zero before the first arrival.
-    arrival = f"{status.error_mm:.2f} mm from the last point, as estimated" if status.error_mm else "none yet"
     row = find_condition(status.condition)
     severity = Severity(max(status.severity, row.severity if row is not None else 0))
     late = f"{status.missed_deadlines}, worst {status.worst_lateness_ms:.0f} ms"
     grip = f"friction {status.friction:.2f}, thrust {status.grip:.2f} times the least that holds the robot"
     bad = f"{status.bad_lines} from the robot, the first: {status.bad_line}; 'ccatp conformance' checks the firmware"
-    remaining = f", {clock(status.eta_s)} remaining, {bound}" if is_under_way(status) else ""
+    count = f"{status.done} of {status.total} {reached}{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"
+    is_over = bool(status.outcome) or status.exit_status >= 0
     rows = [
         ("now", turn_text(status).line),
-        ("state", f"{status.state} {status.point}".strip()),
+        ("state", status.state if is_over else f"{status.state} {status.point}".strip()),
         ("summary state", status.summary_state),
         ("cause", status.cause),
         ("severity", severity.name.lower() if severity else ""),
@@ -190,9 +193,9 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("alarms", alarms_text(status.alarms)),
         ("what to do", row.advice if row is not None else ""),
         ("outcome", status.outcome),
-        ("points", f"{status.done} of {status.total} measured{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"),
-        ("time", f"{clock(status.elapsed_s)} elapsed{remaining}"),
-        ("arrival", arrival),
+        (goals, count),
+        ("time", f"{clock(status.elapsed_s)} elapsed{_remaining(status, with_bound=True)}"),
+        accuracy(status),
         ("grip", grip if status.grip else ""),
         ("event code", f"{status.code} {CODES.get(status.code, '')}".strip()),
         ("late frames", late if status.missed_deadlines else ""),
@@ -214,9 +217,17 @@ def _named(points: Sequence[str]) -> str:
     return names if len(points) <= _SHOWN else f"{len(points)} points: {names}, ..."
 
 
-def status_line(answered: Mapping[str, Any]) -> str:
-    """The status in one line."""
+def _remaining(status: MissionStatus, *, with_bound: bool) -> str:
+    """The remaining time; empty if the mission makes no progress, or does not know it."""
+    if not is_under_way(status) or status.eta_s <= 0.0:
+        return ""
+    bound = f", minimum {clock(status.lower_bound_s)}" if with_bound else ""
+    return f", {clock(status.eta_s)} remaining{bound}"
+
+
+def status_line(answered: Mapping[str, Any], text: RunText | None = None) -> str:
+    """The status in one line; ``text`` as in ``status_rows``."""
     status = _read(answered)
-    remaining = f", {clock(status.eta_s)} remaining" if is_under_way(status) else ""
-    times, what = f"{clock(status.elapsed_s)} elapsed{remaining}", turn_text(status).line
-    return f"{100.0 * share_done(status):.0f} %: {status.done} of {status.total} points, {times}: {what}"
+    goals = "points" if text is None else text.goals
+    times, what = f"{clock(status.elapsed_s)} elapsed{_remaining(status, with_bound=False)}", turn_text(status).line
+    return f"{100.0 * share_done(status):.0f} %: {status.done} of {status.total} {goals}, {times}: {what}"

@@ -26,6 +26,7 @@ def survey_text(cfg: Config) -> RunText:
         details={"world": cfg.world.name},
         title=title,
         goals="points",
+        reached="measured",
         shown=f"mirror {cfg.mirror.name}, {cfg.mirror.panels.count} panels, world {cfg.world.name}",
         progress=_progress,
     )

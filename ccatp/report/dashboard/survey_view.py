@@ -179,7 +179,7 @@ class SurveyView(RunStateView):
 
     def _next_point(self, status: MissionStatus) -> str:
         # On the way to a stop that is not a point the mission has none; then it is the first planned one.
-        if status.point or status.outcome or PLANNED not in self._states:
+        if status.point or PLANNED not in self._states:
             return status.point
         return point_name(self.points[self._states.index(PLANNED)])
 

@@ -307,7 +307,7 @@ class RunStateView:
         if (status := self.status) is not None:
             mission = msgspec.to_builtins(status) | {
                 "is_stale": is_stale(self._status_s),
-                "next_point": self._next_point(status),
+                "next_point": "" if status.outcome or status.exit_status >= 0 else self._next_point(status),
                 "not_to_be_measured": sum(map(len, status.left_out.values())),
                 "finish_in_s": self._finish_in_s(status, now_s),
                 "age_s": round(max(now_s - self._status_s, 0.0), 2),

@@ -12,13 +12,15 @@ from typing import Any
 import msgspec
 import pytest
 
+from ccatp.beacons.config.load import load_radio_config
 from ccatp.cli import main
 from ccatp.conditions.danger import WHEEL_BLOCKED
-from ccatp.config.load import available, load_config
+from ccatp.config.load import available, dump_config, load_config
 from ccatp.config.package import child_environment
 from ccatp.core import Severity
 from ccatp.daemon.operator.terminal import status_line, status_rows
-from ccatp.daemon.supervision.run_text import clock
+from ccatp.daemon.supervision.process import RUN_DIR_FILE
+from ccatp.daemon.supervision.run_text import clock, text_in
 from ccatp.links.topics import MissionStatus
 from ccatp.survey.composition import assemble
 from ccatp.survey.planning.search import leg_lengths
@@ -196,6 +198,35 @@ def test_what_holds_the_robot_is_shown_with_severity_duration_and_advice() -> No
     assert "severity" not in paused
     assert paused["what to do"].startswith("`ccatp resume`")
     assert "what to do" not in dict(status_rows({**wheel, "condition": "of_another_version"}))
+
+
+def test_the_status_of_a_mission_among_beacons_has_its_own_words(tmp_path: Path) -> None:
+    assert text_in(tmp_path) is None
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    (tmp_path / RUN_DIR_FILE).write_text(f"{run_dir}\n")
+    assert text_in(tmp_path) is None  # a run that was removed
+    (run_dir / "config.toml").write_text(dump_config(load_radio_config(None)))
+    text = text_in(tmp_path)
+    visiting = {
+        "state": "visiting",
+        "point": "waypoint 3",
+        "done": 2,
+        "total": 8,
+        "elapsed_s": 22.6,
+        "error_mm": 62.4,
+        "turn": {"kind": "work", "actor": "robot", "next": "go_on"},
+    }
+    assert status_rows(visiting, text)[1:] == [
+        ("state", "visiting waypoint 3"),
+        ("waypoints", "2 of 8 reached  [########......................]"),
+        ("time", "0:23 elapsed"),  # how long it takes is not known
+        ("position", "known to 6.2 cm"),
+        ("event code", "0 normal"),
+    ]
+    assert status_line(visiting, text).startswith("25 %: 2 of 8 waypoints, 0:23 elapsed: visiting")
+    over = {**visiting, "state": "done", "outcome": "stopped", "exit_status": 4}
+    assert dict(status_rows(over, text))["state"] == "done"
 
 
 def test_one_line() -> None:

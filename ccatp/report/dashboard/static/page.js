@@ -273,8 +273,8 @@ function showRobot({ robot, pose, mission }) {
     $("edges").setAttribute("aria-label", label);
     $("edges").title = label;
   }
-  const isHeld = ["held", "idle", "done"].includes(mission?.state);
-  text("held", !robot ? "–" : robot.is_held ? "held by the robot's own rules" : isHeld ? `held, the mission is ${mission.state}` : "follow the drives");
+  const held = { held: "held by the mission", idle: "held, the mission has not begun", done: "held, the mission is over" };
+  text("held", !robot ? "–" : robot.is_held ? "held by the robot's own rules" : held[mission?.state] ?? "follow the drives");
   $("faults").hidden = !robot?.faults.length;
   text("faults", robot?.faults.length ? `■ Robot reports: ${robot.faults.join(", ")}` : "");
   text("pose-xy", pose ? `${pose.x_m.toFixed(3)}, ${pose.y_m.toFixed(3)} m` : "–");
