@@ -99,7 +99,7 @@ class Turn(msgspec.Struct, frozen=True, omit_defaults=True):
     """Whose turn it is, in names; ``ccatp.survey.turn`` makes it, and its words.
 
     ``kind``: of the phase. ``actor``: who acts next. ``next``: the next action. ``bars``: why resume is refused.
-    ``offers``: the requests that the daemon would accept now.
+    ``offers``: the requests that the daemon would accept now. ``resumes``: another daemon can continue the mission.
     """
 
     kind: str = ""
@@ -108,6 +108,7 @@ class Turn(msgspec.Struct, frozen=True, omit_defaults=True):
     why: Cause = NO_CAUSE
     bars: Cause = NO_CAUSE
     offers: tuple[str, ...] = ()
+    resumes: bool = True
 
 
 class MissionStatus(Message):

@@ -24,6 +24,7 @@ from ccatp.survey.engagement import MOVING, EngagedMission, Engagement, Kind
 from ccatp.survey.events import (
     BACKING_OFF,
     DRIVING,
+    IDLE,
     MEASURING,
     RETURNING,
     SETTLING,
@@ -76,12 +77,17 @@ def offers_of(mission: EngagedMission[Any]) -> tuple[str, ...]:
     return tuple(made)
 
 
-def turn_of(s: Engagement, verdict: Verdict | None, offers: tuple[str, ...], waits: Cause = NO_CAUSE) -> Turn:
-    """Whose turn it is; ``waits``: why a robot that works stands, beside the causes in its state."""
+def turn_of(
+    s: Engagement, verdict: Verdict | None, offers: tuple[str, ...], waits: Cause = NO_CAUSE, *, resumes: bool = True
+) -> Turn:
+    """Whose turn it is; ``waits``: why a robot that works stands, beside the causes in its state.
+
+    ``resumes``: another daemon can continue the mission after its end.
+    """
     found = NO_CAUSE if verdict is None else verdict.cause
 
     def turn(actor: Actor, action: Next, why: Cause, bars: Cause = NO_CAUSE) -> Turn:
-        return Turn(kind=s.kind, actor=actor, next=action, why=why, bars=bars, offers=offers)
+        return Turn(kind=s.kind, actor=actor, next=action, why=why, bars=bars, offers=offers, resumes=resumes)
 
     is_shaking = s.interlock or s.levels.is_shaking
     why = s.cause or waits or found
@@ -142,6 +148,7 @@ _MOVES: Mapping[str, str] = {
     SETTLING: "coming to rest at {}",
     MEASURING: "measuring {}",
     BACKING_OFF: "backing off from an edge",
+    IDLE: "about to continue",
     RETURNING: "driving home",
 }
 _THEN = {
@@ -152,6 +159,7 @@ _THEN = {
     Next.RESUME_RUN: "'ccatp run --resume' measures the remaining points",
     Next.NOTHING: "nothing is left to do",
 }
+_ANEW = "a new run begins the mission again"  # for RESUME_RUN of a mission that cannot be continued
 _BEGINS = {Next.GO_ON: "begins by itself", Next.WAIT: "begins by itself when this has ended"}
 _WHO = {
     Actor.ROBOT: "the robot",
@@ -207,13 +215,19 @@ def _hands(cause: Cause) -> str:
     return "" if row is None else row.then
 
 
+def _after_end(turn: Turn, hands: str, *, is_emergency: bool) -> str:
+    if is_emergency and turn.resumes:  # a run that did not begin held would go home again
+        return f"'ccatp run --resume --start-held', then {hands}, then resume"
+    rest = _THEN[Next.RESUME_RUN] if turn.resumes else _ANEW
+    return f"{hands}; {rest}" if turn.next == Next.HANDS else rest
+
+
 def _then(turn: Turn) -> str:
     hands, action = _hands(turn.bars or turn.why), Next(turn.next)
     is_emergency = turn.why.condition in (EARTHQUAKE.name, EMERGENCY.name)
     match action:
-        case Next.HANDS if turn.kind == Kind.OVER:
-            held = f"'ccatp run --resume --start-held', then {hands}, then resume"  # another run would go home again
-            return held if is_emergency else f"{hands}; {_THEN[Next.RESUME_RUN]}"
+        case Next.HANDS | Next.RESUME_RUN if turn.kind == Kind.OVER:
+            return _after_end(turn, hands, is_emergency=is_emergency)
         case Next.HANDS if turn.bars:
             what = "until this has ended" if turn.bars == turn.why else f"while this lasts: {text_of(turn.bars)}"
             return f"{hands or 'wait'}; resume is refused {what}"

@@ -128,7 +128,7 @@ class BeaconRunner(MissionRunner):
         self.telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode)
         if HELD in (mode, before) or mode is RETURNING:
             is_resumed = before is HELD and mode not in (HELD, RETURNING, DONE)
-            what = f"resumed: {mode}" if is_resumed else f"{mode}"
+            what = ("resumed" if mode is IDLE else f"resumed: {mode}") if is_resumed else f"{mode}"
             text = f"{what}: {text_of(state.cause)}" if state.cause else what
             level = "warning" if mode in (HELD, RETURNING) else "info"
             self.telemetry.notify_operator(level, text)

@@ -67,7 +67,9 @@ class MainLoop:
         self._is_restarted = args.is_restarted
         danger = args.endpoints.of("danger")
         self.peer = VerdictSubscriber(context, danger, cfg.mission.verdict_timeout_s, self.heartbeat.publish_if_due)
-        limits: LoopLimits = kind_of(cfg).limits.get()(cfg)
+        kind = kind_of(cfg)
+        self._resumes = kind.no_resume is None
+        limits: LoopLimits = kind.limits.get()(cfg)
         self.clock = MissionClock(limits.clock_jump_s)
         self.frame_period_s = 0.0
         self.exit_status = ExitStatus.INTERRUPTED
@@ -243,7 +245,9 @@ class MainLoop:
         status.alarms = self._alarms.alarms.alarms
         status.stopped_by = self._stopped_by
         mission = self._runner.mission
-        status.turn = turn_of(mission.state, verdict, offers_of(mission), self._runner.wait_cause)
+        status.turn = turn_of(
+            mission.state, verdict, offers_of(mission), self._runner.wait_cause, resumes=self._resumes
+        )
         status.summary_state = str(mission.state.summary_state)
         return status
 

@@ -111,4 +111,4 @@ def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
 
 def test_the_first_row_of_the_status_says_whose_turn_it_is(loop: MainLoop) -> None:
     shown = status_rows(msgspec.to_builtins(loop.status()))
-    assert shown[0] == ("now", "idle. Next: the robot continues by itself")
+    assert shown[0] == ("now", "about to continue. Next: the robot continues by itself")

@@ -108,6 +108,19 @@ def test_the_line(s: Engagement, verdict: Verdict | None, offers: tuple[str, ...
     assert line_of(s, verdict, offers, **told) == line
 
 
+def test_nobody_is_told_to_resume_a_mission_that_cannot_be_continued() -> None:
+    stopped = Engagement(Over(SurveyOutcome.STOPPED), cause=BLOCKED)
+    for s, hands in ((stopped, "look for an obstacle at the wheel; "), (Engagement(Over(SurveyOutcome.STOPPED)), "")):
+        turn = turn_of(s, None, (), resumes=False)
+        assert turn_text(status_of(s, turn)).then == f"{hands}a new run begins the mission again"
+    at_base = Engagement(Over(SurveyOutcome.AT_BASE), cause=EMERGENCY.cause(kind="fire"))
+    then = turn_text(status_of(at_base, turn_of(at_base, None, (), resumes=False))).then
+    assert then == "clear the emergency when its cause is gone; a new run begins the mission again"
+    faulted = Engagement(Faulted(), cause=Cause("unknown"))  # the daemon ended without the end of its mission
+    text = turn_text(status_of(faulted, turn_of(faulted, None, (), resumes=False), exit_status=int(ExitStatus.HELD)))
+    assert text.then == "a new run begins the mission again"
+
+
 def test_what_held_the_robot_is_not_why_an_operator_stopped_it() -> None:
     s = Engagement(Over(SurveyOutcome.STOPPED), cause=ENCODERS_STALE.cause())
     line = line_of(s, condition=s.cause.condition, cause="encoder samples stale", stopped_by="eva")
