@@ -240,7 +240,8 @@ class Recorder:
             with suppress(OSError):
                 self._files.close()
             if self._on_failure is not None:
-                self._on_failure(f"{self.path}: recording ended: {error}")
+                why = error.strerror if isinstance(error, OSError) and error.strerror else error
+                self._on_failure(f"{self.path}: recording ended: {why}")
 
 
 def recordings(path: Path) -> list[Path]:
