@@ -18,7 +18,8 @@ from ccatp.conditions.danger import BATTERY_LOW, EARTHQUAKE, EMERGENCY, ENCODERS
 from ccatp.conditions.mission import OPERATOR
 from ccatp.config.load import load_config
 from ccatp.core import ALL_MOTION, NO_MOTION, Cause, DeckPose, EventCode, PointId, Severity, Verdict
-from ccatp.links.topics import Alarm, FixMessage, SeverityName, TrackMessage
+from ccatp.daemon.supervision.process import open_log
+from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Alarm, FixMessage, SeverityName, TrackMessage
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.dashboard.survey_view import point_name, survey_points
 from ccatp.survey.engagement import Engagement, Faulted, Held, Kind, Over, Paused, Phase
@@ -35,6 +36,12 @@ SIZES = {"desktop": (1440, 900), "phone": (390, 844)}
 SCHEMES: tuple[Literal["dark", "light"], ...] = ("dark", "light")
 MEASURED, LEG_S = 7, 10.0
 PERIOD_S, SETTLE_MS = 0.1, 800
+# Messages: one of a word, and one of several lines.
+LOG = (
+    ("info", "resumed: turning"),
+    ("warning", "measurement of the robot's place failed: Etalon server 127.0.0.1:2001: no reply to laserready within "
+     "3.0 s; restart its laser driver or raise [etalon] request_timeout_s"),
+)  # fmt: skip
 LINE = (
     b'{"type":"sensors","seq":5,"t":1.5,"imu":[],"enc":[],"edge":[[1.5,1,1,1,1]],"gravity":null,"fans":[0.8,0.8],'
     b'"soc":0.61,"cmd":{"seq":4,"age":0.012,"permit_age":0.008,"held":false},"faults":[]}'
@@ -160,6 +167,9 @@ async def picture_states(folder: Path, names: Sequence[str]) -> None:
                 if shown.emergency:
                     active = {"kind": shown.emergency, "id": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11", "note": "reported"}
                     (Path(run_dir) / "emergencies.json").write_bytes(msgspec.json.encode({"active": [active]}))
+                log = open_log(Path(run_dir) / "log.jsonl", "main")
+                for level, text in LOG:
+                    log.log(LEVELS[level], OPERATOR_MESSAGE, text=text)
                 async with page_rig(CFG, Path(run_dir)) as rig, asyncio.TaskGroup() as tasks:
                     living = tasks.create_task(_live(rig, shown))
                     page = await browser.new_page()

@@ -95,7 +95,7 @@ def drives_and_is_held(run: Run, page: Page, camera: Camera) -> None:
     run.until(lambda status: status["done"] >= DONE and status["state"] == "driving", PATIENCE_S)
     camera.take("driving")
     camera.take("phone", PHONE)
-    expect(page.locator("#alarms li")).to_have_count(1)  # the battery
+    expect(page.locator("#alarms li")).to_have_count(1, timeout=1e3 * PATIENCE_S)  # the battery
     for kind, note in EMERGENCIES.items():
         run.ask("emergency", "emergency", kind=kind, id=f"6f1c3c1e-5a0f-4d0e-9f2b-{len(kind):012d}", note=note)
     run.until_state("held")

@@ -228,7 +228,7 @@ function showMission(state) {
   text("skipped", String(Math.max(mission.skipped, mission.not_to_be_measured)));
   $("bad-lines-row").hidden = !mission.bad_lines;
   text("bad-lines", `${mission.bad_lines}, the first: ${mission.bad_line}`);
-  text("late-frames", mission.missed_deadlines ? `${mission.missed_deadlines}, ≤ ${mission.worst_lateness_ms.toFixed(0)} ms` : "0");
+  text("late-frames", mission.missed_deadlines ? `${mission.missed_deadlines} (${mission.worst_lateness_ms.toFixed(0)} ms)` : "0");
 }
 
 // Names and values of further facts of a mission.
