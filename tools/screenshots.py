@@ -106,7 +106,7 @@ def drives_and_is_held(run: Run, page: Page, camera: Camera) -> None:
 
 def picture_dashboard(folder: Path) -> None:
     """Make those of the dashboard."""
-    look(folder, ("--panels", "1", "--realtime"), waits)
+    look(folder, ("--panels", "1", "--realtime", "--set", "robot.lag_limit_s=0.15"), waits)  # the machine may be busy
     look(folder, ("--panels", "9"), ends)
     look(folder, ("--panels", "40"), drives_and_is_held)
 
