@@ -34,7 +34,7 @@ from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.mirror.panel_alignment import fit_panels
 from ccatp.records.run_reader import Trace, TraceBuilder, trace_of_truth
 from ccatp.records.summary import PanelFits, SummaryBuilder
-from ccatp.sim.fault_plan import FaultPlan, Injected
+from ccatp.sim.fault_plan import FaultPlan, Injected, InjectedFault
 from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
 from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
@@ -130,11 +130,14 @@ class SilTrace:
 class SilLaser:
     """Measures the puck of a simulated robot; ``stops`` keeps the measurements whose fix was fused, in order."""
 
-    def __init__(self, cfg: Config, mirror: Mirror, robot: Robot | MotorRobot) -> None:
+    def __init__(
+        self, cfg: Config, mirror: Mirror, robot: Robot | MotorRobot, faults: tuple[InjectedFault, ...] = ()
+    ) -> None:
         self._cfg, self._mirror, self._robot = cfg, mirror, robot
         channels, collimators_m = mirror.channels, mirror.collimators_m
         rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
         self._etalon = EtalonModel(cfg.sim.etalon, channels, collimators_m, rng)
+        self._etalon.faults = tuple(fault for fault in faults if fault.signal == "laser")
         self._judge = FixJudge(cfg.etalon, dict(zip(channels, collimators_m, strict=True)))
         self._approaches = ApproachCounter(cfg.mission.correction_tolerance_m, cfg.mission.max_approaches)
         self._fixes: list[Measured] = []
@@ -208,8 +211,8 @@ class NoFrames(RuntimeError):
 class SilRun:
     """The processes' parts side by side; a subclass may exchange some before ``run``, or override a frame.
 
-    ``faults``: of the robot. A frame that cannot be decoded is passed over, one that is not newer is answered with
-    zeros.
+    ``faults``: of the robot and of the laser. A frame that cannot be decoded is passed over, one that is not newer is
+    answered with zeros.
     """
 
     def __init__(self, cfg: Config, faults: FaultPlan | None = None) -> None:
@@ -224,7 +227,7 @@ class SilRun:
             else motor_robot(cfg)
         )
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
-        self.laser = SilLaser(cfg, self.mirror, self.robot)
+        self.laser = SilLaser(cfg, self.mirror, self.robot, () if faults is None else faults.faults)
         self.trace = SilTrace(parts)
         self.states_s = defaultdict(float, {Mode.IDLE: 0.0})
         self.denied_s: list[float] = []  # when lines that were no frames took the permit away
