@@ -128,16 +128,17 @@ class FakeDevices:
             waiting = [fd for one in self._terminals.values() for fd in one.fds]
             ready, _, _ = select.select([*waiting, *self._lines.fds, 0], [], [], _WAIT_S)
             if 0 in ready:
-                self._change(sys.stdin.readline().split(maxsplit=3))
+                lines = os.read(0, _CHUNK).decode().splitlines()
+                self._is_over |= not lines  # the other end is gone
+                for line in lines:
+                    self._change(line.split(maxsplit=3))
             for one in self._terminals.values():
                 one.exchange()
             self._lines.answer(set(ready))
             self._watch()
 
     def _change(self, words: list[str]) -> None:
-        if not words:
-            self._is_over = True  # the other end is gone
-        elif words[0] == "set":
+        if words[0] == "set":
             device = dict(zip(self._terminals, self._bench.ports.values(), strict=True))[words[1]]
             setattr(device, words[2], json.loads(words[3]))
         else:
@@ -180,7 +181,7 @@ def main() -> int:
         return {key.replace(".", "__"): json.loads(value) for key, _, value in pairs}
 
     cfg = pioneer_config(options.system, **settings(options.settings))
-    names = {"devices__base__device": "/dev/base", "devices__radio__device": "/dev/radio"}
+    names = {"devices__base__device": "/dev/base", "devices__radio__device": "/dev/radio", "robot__loop_hz": 100.0}
     onboard = onboard_config(cfg, **(names | settings(options.robot)))
     devices = FakeDevices(BeaconBench(cfg, onboard, WallTime()), options.folder)
     (options.folder / "robot.toml").write_text(config_at(options.folder, onboard))

@@ -22,6 +22,8 @@ PIONEER: dict[str, Any] = {
     "danger__radio_timeout_s": 25.0,
     "mission__time_limit_s": 3000.0,
 }
+# A scan takes ten seconds and more instead of none: the target moves as far between two scans as in the simulation.
+SLOWER = {"mission__follow_s": 450.0, "sim__target__speed_m_s": 0.0065, "follow__lost_after_s": 60.0}
 REAR_SONARS = [15, 14, 13, 12, 11, 10, 9, 8]
 
 

@@ -11,7 +11,7 @@ from ccatp.beacons.sim.robot import build_beacon_robot
 from ccatp.beacons.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
 from ccatp.links.robot_codec import MAX_LINE_BYTES, decode_from_robot
 from ccatp.links.robot_messages import Sensors
-from tests.support.beacon_rig import BeaconRig, DrivenRobot, onboard_config, pioneer_config
+from tests.support.beacon_rig import SLOWER, BeaconRig, DrivenRobot, onboard_config, pioneer_config
 
 CFG = pioneer_config("zigbee")
 
@@ -188,9 +188,7 @@ def test_a_lap_among_radios_through_the_drivers_is_as_good_as_simulated() -> Non
 
 @pytest.mark.slow
 def test_a_radio_is_followed_through_the_drivers() -> None:
-    # A scan takes ten seconds instead of none: the target moves as far between two scans as in the simulation.
-    slower = {"mission__follow_s": 450.0, "sim__target__speed_m_s": 0.0065, "follow__lost_after_s": 60.0}
-    simulated, driven = mission("follow", overrides={}, driven=slower)
+    simulated, driven = mission("follow", overrides={}, driven=SLOWER)
     assert simulated.outcome == driven.outcome == "complete"
     assert position_m(driven) < position_m(simulated) + 0.03
     assert driven.summary["target"]["distance_min_m"] > 0.4
