@@ -101,3 +101,14 @@ def test_labyrinth_smoothed() -> None:
     reported = " | ".join(run.warnings)
     assert "wheel columns are read as left, right and half the track of 0.157 m" in reported
     assert "ranges read +5.0 per cent" in reported
+
+
+def test_a_beacon_that_could_not_be_placed_does_not_bend_the_map_of_the_others() -> None:
+    """The errors of the Jackal's ranges last; a beacon at its mirror image turned the others by 1.1 m."""
+    run = read_run(DATA / "uwb_jackal/jackal_complex_tag_p.csv.gz")
+    track = estimate(run, load_recordings_config(), "fixed-lag")
+    found = judge(track, run)
+    assert len(track.beacons) == len(run.beacon_ids) - 1
+    assert found.beacon_rmse_m is not None
+    assert found.beacon_rmse_m < 0.5
+    assert any("dead reckoning on the same map" in warning for warning in track.warnings)

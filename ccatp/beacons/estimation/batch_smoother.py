@@ -14,8 +14,7 @@ from scipy.linalg import LinAlgError
 
 from ccatp.beacons.config.models import FixedLagConfig, RadioNoiseConfig, RecordingConfig, SlamFilterConfig
 from ccatp.beacons.estimation.batch_problem import BEACON, RSSI_REFERENCE, SHARED, BatchProblem, BatchState, PlacePrior
-from ccatp.beacons.estimation.beacon_slam import BeaconSlam
-from ccatp.beacons.estimation.causal import beyond_priors, follow
+from ccatp.beacons.estimation.causal import Followed, beyond_priors, follow
 from ccatp.beacons.estimation.evaluation import aligned_beacons
 from ccatp.beacons.estimation.landmark_init import LEAST
 from ccatp.beacons.estimation.least_squares import WELL_CONVERGED, Factored, descend, t_weights
@@ -34,9 +33,6 @@ NOISY = 4.0  # largest increase of the noise without a warning
 LITTLE = 0.1  # a reading with a smaller weight counts as refused
 
 
-Found = tuple[EstimatedPath, BeaconSlam]
-
-
 class Start(NamedTuple):
     """Initial values of the smoother."""
 
@@ -45,9 +41,9 @@ class Start(NamedTuple):
     doubtful: BoolArray  # beacons that have not joined the filter's map: the mirror image may fit as well, shape (b,)
 
 
-def _started(run: RecordedRun, settings: RecordingConfig, found: Found, times_s: FloatArray) -> Start:
+def _started(run: RecordedRun, settings: RecordingConfig, found: Followed, times_s: FloatArray) -> Start:
     """Path, map and calibration of the filter; a beacon that still waits begins at its best candidate."""
-    slam, poses = found[1], _poses_at(found[0], times_s)
+    slam, poses = found.slam, _poses_at(found.path, times_s)
     priors, shared = settings.priors, np.zeros(len(SHARED))
     for name, (value, _) in slam.calibration.items():
         shared[SHARED.index(name)] = value
@@ -58,7 +54,7 @@ def _started(run: RecordedRun, settings: RecordingConfig, found: Found, times_s:
         waiting = slam.waiting.get(name)
         if name in slam.beacons:
             mean = slam.beacons[name].mean
-        elif waiting is not None and waiting.candidates:
+        elif waiting is not None and waiting.candidates and (run.readings.beacon == k).any():
             mean, doubtful[k] = waiting.candidates[0].mean, True
         else:
             continue
@@ -85,15 +81,18 @@ def lagged_run(
 ) -> EstimatedPath:
     """The fixed-lag smoother over a recording.
 
-    Its map is that of the smoother over the last ``map_s``, moved to the frame of the filter's path. If these data do
-    not determine all beacons, the map is the filter's.
+    Its map is that of the smoother over the last ``map_s``, with the noise and the priors that were learnt, moved to
+    the frame of the causal path. If these data do not determine all beacons, the map is that of the window.
     """
-    path, slam = follow(run, cfg, how, clock_s, lag=lag)
+    found = follow(run, cfg, how, clock_s, lag=lag)
+    path = found.path
     steps, readings = run.steps, run.readings
     first = int(np.searchsorted(steps.times_s, steps.times_s[-1] - lag.map_s))
     rows = (np.broadcast_to(row, steps.distance_m.shape)[first:] for row in steps[1:])
     kept = Steps(steps.times_s[first:], *rows)
-    recent = replace(run, steps=kept, readings=readings.where(readings.times_s >= kept.times_s[0]))
+    # A beacon that is not on the map may lie at its mirror image, and would bend path and map.
+    placed = np.isin(readings.beacon, [k for k, name in enumerate(run.beacon_ids) if name in path.beacons])
+    recent = replace(run, steps=kept, readings=readings.where(placed & (readings.times_s >= kept.times_s[0])))
     if first:
         x_m, y_m, heading_rad = _poses_at(path, kept.times_s[:1])[0].tolist()
         recent = replace(recent, first_pose=(x_m, y_m, heading_rad))
@@ -101,7 +100,7 @@ def lagged_run(
         if any(heard[name] < LEAST for name in path.beacons):
             return path
     try:
-        whole = smooth(recent, cfg, how, clock_s, (path, slam))
+        whole = smooth(recent, cfg, how, clock_s, found)
     except LinAlgError:
         return path
     if run.known_map is not None:  # the smoother's map is in the frame of the known one
@@ -119,14 +118,14 @@ def _part_of_map(track: EstimatedPath, names: Collection[str]) -> FloatArray:
 
 def smooth(
     run: RecordedRun, settings: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float],
-    found: Found | None = None,
+    found: Followed | None = None,
 ) -> EstimatedPath:  # fmt: skip
     """Estimate a whole run at once.
 
     Minimises the negative log posterior of poses at the instants of the readings, beacons and calibration by
     Levenberg-Marquardt. The readings have Student's t, whose width is increased if the residuals are wider. The first
-    pose is the only part of the ground truth that is used. ``found``: results of the filter, if it has processed the
-    run already. Raises LinAlgError: the normal equations of the result are not positive definite.
+    pose is the only part of the ground truth that is used. ``found``: a causal estimate of the run, if there is one.
+    Raises LinAlgError: the normal equations of the result are not positive definite.
     """
     begin_s, first_radio = clock_s(), settings.radio
     steps_s = run.steps.times_s  # poses are at all readings, and every SPACING_S at a step of the odometry
@@ -134,12 +133,19 @@ def smooth(
     readings = run.readings.with_distances(settings.radio.camera_field_rad)
     times_s = np.union1d(readings.times_s, steps_s[first])
     found = found or follow(run, settings, how, lambda: 0.0, SPACING_S)
+    settings = settings.model_copy(update={"priors": found.priors})
     start, rest = _started(run, settings, found, times_s), (how.rest_speed_m_s, how.rest_turn_rad_s)
-    removed = {str(name) for name, _ in found[1].moved}
+    removed = {str(name) for name, _ in found.slam.moved}
     places = None
     if run.known_map is not None:
         places = PlacePrior.of_run(run, [name for name in run.beacon_ids if name not in removed])
-    problem = BatchProblem(run.steps, readings, times_s, run.first_pose, settings, start.used, rest, places=places)
+
+    def problem_of(settings: RecordingConfig) -> BatchProblem:
+        return BatchProblem(
+            run.steps, readings, times_s, run.first_pose, settings, start.used, rest, noise=found.noise, places=places
+        )  # fmt: skip
+
+    problem = problem_of(settings)
     counted = problem.sizes > 0
     off = problem.residuals(start.state).chi2[counted] / problem.sizes[counted]
     state, softness = start.state, float(np.median(off)) if counted.any() else 0.0
@@ -151,11 +157,11 @@ def smooth(
         if radio == problem.radio:
             break
         settings = settings.model_copy(update={"radio": radio})
-        problem = BatchProblem(run.steps, readings, times_s, run.first_pose, settings, start.used, rest, places=places)
+        problem = problem_of(settings)
         state, converged = descend(problem, state, ITERATIONS)
     took_s = clock_s() - begin_s
     weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)
-    factored = Factored(problem.normal_equations(state, weights))
+    factored = Factored(problem.normal_equations(state, weights * problem.power))
     size = problem.free.size
     covariance = np.zeros((size, size))
     covariance[np.ix_(problem.free, problem.free)] = factored.shared_covariance()

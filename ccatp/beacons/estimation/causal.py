@@ -5,10 +5,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from itertools import pairwise
 from math import inf, pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.beacons.config.models import FixedLagConfig, PriorsConfig, RecordingConfig, SlamFilterConfig
+from ccatp.beacons.estimation.batch_problem import BeaconNoise
 from ccatp.beacons.estimation.beacon_map import HEADING
 from ccatp.beacons.estimation.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
 from ccatp.beacons.estimation.motion import Increment
@@ -120,14 +122,23 @@ def filter_run(
     run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float]
 ) -> EstimatedPath:
     """Run the filter over a recording; the first pose is the only part of the ground truth that is used."""
-    return follow(run, cfg, how, clock_s)[0]
+    return follow(run, cfg, how, clock_s).path
+
+
+class Followed(NamedTuple):
+    """A causal estimate of a run, and what it has learnt by the end of it."""
+
+    path: EstimatedPath
+    slam: BeaconSlam
+    priors: PriorsConfig  # of the calibration in use
+    noise: BeaconNoise | None  # of the ranges, as estimated; None by the filter alone
 
 
 def follow(
     run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float],
     finest_s: float = FINEST_S, lag: FixedLagConfig | None = None,
-) -> tuple[EstimatedPath, BeaconSlam]:  # fmt: skip
-    """The filter's path, and the filter at the end of the run.
+) -> Followed:  # fmt: skip
+    """The path of the filter, or with ``lag`` that of the fixed-lag smoother.
 
     ``finest_s``: steps of odometry within an interval of this length are combined, but cut at each reading.
     """
@@ -154,11 +165,13 @@ def follow(
             window.step(float(times[k]), search.all, times[: k + 1], poses[: k + 1])
             poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
     delayed = None if window is None else window.delayed(search.best, times, poses, covariances)
-    path = _result(run, search.best, log, cfg.priors if window is None else window.priors)
+    priors, noise = (cfg.priors, None) if window is None else (window.priors, window.noise)
+    path = _result(run, search.best, log, priors)
     found = () if window is None else window.findings()
-    return path._replace(
+    path = path._replace(
         times_s=times, poses=poses, covariances=covariances, delayed=delayed, warnings=(*path.warnings, *found)
-    ), search.best
+    )
+    return Followed(path, search.best, priors, noise)
 
 
 class _Log:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ccatp.beacons.config.models import RadioNoiseConfig
 from ccatp.beacons.estimation.measurement_models import range_variance
+from ccatp.beacons.estimation.predictions import predicted, prediction_lines
 from ccatp.beacons.estimation.recording import Calibrated, EstimatedPath, RecordedRun, antenna_path
 from ccatp.beacons.rigid_motion import rigid_modes
 from ccatp.core import FloatArray
@@ -100,9 +101,11 @@ def next_reading(track: EstimatedPath, noise: RadioNoiseConfig) -> dict[str, Any
 
 
 def reviewed(run: RecordedRun, track: EstimatedPath, noise: RadioNoiseConfig) -> dict[str, Any]:
-    """Residuals and the best next measurement, for JSON of ``ccatp radio slam``."""
+    """Residuals, errors of predicted ranges and the best next measurement, for JSON of ``ccatp radio slam``."""
     residuals = residuals_by_beacon(run, range_residuals(run, track, noise.camera_field_rad))
-    return {"residuals": residuals, "measure_next": next_reading(track, noise)}
+    found = predicted(run, track, noise.camera_field_rad)
+    predictions = None if found is None else found._asdict()
+    return {"residuals": residuals, "predictions": predictions, "measure_next": next_reading(track, noise)}
 
 
 def review_lines(data: Mapping[str, Any]) -> Iterator[str]:
@@ -112,6 +115,7 @@ def review_lines(data: Mapping[str, Any]) -> Iterator[str]:
         yield f"{'beacon':<8} {'ranges':>9} {'median_m':>9} {'sigma_m':>8}"
         for name, one in data["residuals"].items():
             yield f"{name:<8} {one['readings']:9.0f} {one['median_m']:9.3f} {one['sigma_m']:8.3f}"
+    yield from prediction_lines(data["predictions"])
     if (advice := data["measure_next"]) is not None:
         x_m, y_m = advice["from_m"]
         yield ""

@@ -59,7 +59,10 @@ class _Solved(NamedTuple):
 
 
 class Window:
-    """Solves the window and corrects a ``BeaconSlam``; ``delayed`` is the path as estimated ``lag_s`` later."""
+    """Solves the window and corrects a ``BeaconSlam``; ``delayed`` is the path as estimated ``lag_s`` later.
+
+    ``noise``: of the ranges, as estimated from the last solution.
+    """
 
     def __init__(self, run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, lag: FixedLagConfig) -> None:
         self._run, self._lag, self._spacing_s = run, lag, lag.lag_s / lag.poses
@@ -72,7 +75,7 @@ class Window:
         self._marginal: MarginalPrior | None = None
         self._last: _Solved | None = None
         self._seen: tuple[object, ...] = (0, 0)
-        self._noise = BeaconNoise.configured(len(run.beacon_ids))
+        self.noise = BeaconNoise.configured(len(run.beacon_ids))
         self._places = None if run.known_map is None else PlacePrior.of_run(run, run.beacon_ids)
         self._wide, self._cfg = cfg.priors, cfg.model_copy(update={"priors": narrowed(cfg.priors, ())})
         self._due_s, self._placed = self._begin_s, frozenset[str]()
@@ -112,9 +115,9 @@ class Window:
         self._last = solved
         self._correct(slam, solved, time_s)
         self._widen(solved)
-        self._noise = range_noise(solved.problem, solved.state)
+        self.noise = range_noise(solved.problem, solved.state)
         for k, name in enumerate(self._run.beacon_ids):
-            slam.take_noise(name, *(float(column[k]) for column in (self._noise.variance, *self._noise[2:])))
+            slam.take_noise(name, *(float(column[k]) for column in (self.noise.variance, *self.noise[2:])))
         self._hand_over(time_s - self._lag.lag_s)
         if time_s - self._begin_s > self._lag.window_s:
             self._marginalise(time_s - KEPT * self._lag.window_s)
@@ -142,10 +145,10 @@ class Window:
 
     def findings(self) -> Iterator[str]:
         """What was found of the noise, and what was done about it."""
-        names = [(name, k) for k, name in enumerate(self._run.beacon_ids) if self._noise.repeats[k] > REPORTED]
+        names = [(name, k) for k, name in enumerate(self._run.beacon_ids) if self.noise.repeats[k] > REPORTED]
         for name, k in names:
             yield (
-                f"range errors of beacon {name} last for {self._noise.lasts_s[k]:.1f} s: {self._noise.repeats[k]:.0f} "
+                f"range errors of beacon {name} last for {self.noise.lasts_s[k]:.1f} s: {self.noise.repeats[k]:.0f} "
                 "of its readings count as one"
             )
 
@@ -168,7 +171,7 @@ class Window:
         steps = self._steps(begin_s, end_s)
         return BatchProblem(
             steps, readings, times_s, self._run.first_pose, self._cfg, used, self._rest, self._marginal,
-            self._noise, self._places,
+            self.noise, self._places,
         )  # fmt: skip
 
     def _solution(

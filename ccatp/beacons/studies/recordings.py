@@ -22,6 +22,7 @@ from ccatp.beacons.estimation.causal import filter_run
 from ccatp.beacons.estimation.evaluation import RECKONING, judge, reckoned_track, result_data
 from ccatp.beacons.estimation.level_fix import LevelLocator, fingerprint_fits, grid_points, judged
 from ccatp.beacons.estimation.path_loss import fit_path_loss
+from ccatp.beacons.estimation.predictions import predicted, prediction_doubts
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, Progress, import_gtsam, run_gtsam
 from ccatp.beacons.studies.recorded_sets import SHIPPED, recorded_run, recorded_window, sets_in
@@ -58,10 +59,9 @@ def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> E
         raise EstimateError(
             f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"
         ) from error
-    track = track._replace(warnings=(*track.warnings, *sudden_disagreement(track)))
-    if run.truth is not None:
-        return track
-    return track._replace(warnings=(*track.warnings, *survey_doubts(track, run.beacon_truth_m)))
+    surveyed = survey_doubts(track, run.beacon_truth_m) if run.truth is None else ()
+    doubts = prediction_doubts(predicted(run, track, cfg.radio.camera_field_rad))
+    return track._replace(warnings=(*track.warnings, *sudden_disagreement(track), *surveyed, *doubts))
 
 
 COMPARED = (

@@ -387,7 +387,10 @@ def test_a_twentieth_of_the_readings_refused_is_reported() -> None:
 def test_the_map_of_a_fixed_lag_fits_all_that_is_kept_in_the_frame_of_its_path() -> None:
     run, given = recorded(world(1)), (CONFIG.csv, CONFIG.filter)
     lag = FixedLagConfig(lag_s=10.0, poses=10, window_s=120.0, map_s=3600.0)
-    causal, whole = filter_run(run, *given, no_clock), smooth(run, *given, no_clock)
+    causal, whole = (
+        filter_run(run, *given, no_clock),
+        smooth(run, *given, no_clock, follow(run, *given, no_clock, lag=lag)),
+    )
     track = lagged_run(run, *given, no_clock, lag)
     assert track.beacons.keys() == causal.beacons.keys()
     found, best, own = (np.array([of.beacons[name][:2] for name in track.beacons]) for of in (track, whole, causal))
@@ -399,7 +402,7 @@ def test_the_map_of_a_fixed_lag_fits_all_that_is_kept_in_the_frame_of_its_path()
     one, *_ = track.beacons
     early = run.readings.where((run.readings.times_s < 30.0) | (run.readings.beacon != run.beacon_ids.index(one)))
     without_it, short = replace(run, readings=early), lag.model_copy(update={"map_s": 10.0})
-    forgetful, (of_filter, _) = (
+    forgetful, (of_filter, *_) = (
         lagged_run(without_it, *given, no_clock, short),
         follow(without_it, *given, no_clock, lag=short),
     )

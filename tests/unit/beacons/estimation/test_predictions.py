@@ -1,0 +1,52 @@
+"""Prediction errors of a causal estimate beside dead reckoning, without a truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.config.load import load_recordings_config
+from ccatp.beacons.estimation.predictions import predicted, prediction_doubts, prediction_lines
+from ccatp.beacons.studies.recordings import estimate
+from ccatp.beacons.studies.trait_runs import trait_run
+
+CONFIG = load_recordings_config(None)
+
+
+def test_a_good_estimate_predicts_ranges_to_their_noise_and_better_than_dead_reckoning() -> None:
+    run = trait_run([], 2)
+    found = predicted(run, track := estimate(run, CONFIG, "fixed-lag"), 0.0)
+    assert found is not None
+    assert found.estimate_m == pytest.approx(0.05, abs=0.04)  # the noise of a range is 5 to 12 cm
+    assert found.reckoned_m > 2.0 * found.estimate_m
+    assert found.correlation is not None
+    assert abs(found.correlation) < 0.15
+    assert not list(prediction_doubts(found))
+    assert not any("dead reckoning" in line for line in track.warnings)
+
+
+def test_errors_of_ranges_that_last_are_shown_as_a_correlation() -> None:
+    run = trait_run(["correlated"], 2)
+    found = predicted(run, estimate(run, CONFIG, "fixed-lag"), 0.0)
+    assert found is not None
+    assert found.correlation is not None
+    assert found.correlation > 0.4
+    assert any("whiteness" in line for line in prediction_lines(found._asdict()))
+
+
+def test_an_estimate_that_dead_reckoning_beats_gives_a_warning() -> None:
+    run = trait_run([], 2)
+    track = estimate(run, CONFIG, "fixed-lag")
+    wander = 1.0 * np.sin(np.arange(len(track.times_s)) / 20.0)[:, None]
+    lost = track._replace(poses=track.poses + wander * (1.0, 1.0, 0.0))
+    (warning,) = prediction_doubts(predicted(run, lost, 0.0))
+    assert "dead reckoning on the same map" in warning
+
+
+def test_too_few_ranges_say_nothing() -> None:
+    run = trait_run([], 2)
+    track = estimate(run, CONFIG, "fixed-lag")
+    few = replace(run, readings=run.readings.where(run.readings.times_s < 1.0))
+    assert predicted(few, track, 0.0) is None
+    assert not list(prediction_doubts(None))
+    assert not list(prediction_lines(None))
