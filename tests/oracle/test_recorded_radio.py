@@ -105,7 +105,7 @@ def test_labyrinth_smoothed() -> None:
 
 def test_a_beacon_that_could_not_be_placed_does_not_bend_the_map_of_the_others() -> None:
     """The errors of the Jackal's ranges last; a beacon at its mirror image turned the others by 1.1 m."""
-    run = read_run(DATA / "uwb_jackal/jackal_complex_tag_p.csv.gz")
+    run = read_run(DATA / "uwb_jackal/jackal_complex_tag_p.csv.gz", None, None)
     track = estimate(run, load_recordings_config(), "fixed-lag")
     found = judge(track, run)
     assert len(track.beacons) == len(run.beacon_ids) - 1
