@@ -127,7 +127,8 @@ def _since(found: CalibratedSurveys, effect: Effect) -> str:
     if not effect.since:
         return _of_survey(found, effect)
     point, t_s = found.points[effect.since]
-    return f" since about point {'/'.join(map(str, point))} ({t_s:.0f} s by the robot's clock)"
+    survey = f" of survey {found.network.given.survey[effect.since] + 1}" if len(found.surveys) > 1 else ""
+    return f" since about point {'/'.join(map(str, point))}{survey} ({t_s:.0f} s by the robot's clock)"
 
 
 def _of_survey(found: CalibratedSurveys, effect: Effect) -> str:
