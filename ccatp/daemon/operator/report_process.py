@@ -29,10 +29,19 @@ ANSWER_BYTES = 65_536
 
 
 class ReportProcess:
-    """Draws the report of one run on request; ``start`` starts a module with arguments and descriptors."""
+    """Draws the report of one run on request.
 
-    def __init__(self, start: Callable[[str, Sequence[str], Sequence[int]], ChildProcess], run_dir: Path) -> None:
-        self._start, self._run_dir = start, run_dir
+    ``start`` starts a module with arguments and descriptors. ``locks``: descriptors that it inherits; who comes next in
+    the run directory waits for them.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[str, Sequence[str], Sequence[int]], ChildProcess],
+        run_dir: Path,
+        locks: Sequence[int] = (),
+    ) -> None:
+        self._start, self._run_dir, self._locks = start, run_dir, locks
         self._process: ChildProcess | None = None
         self._channel: socket.socket | None = None
 
@@ -42,7 +51,8 @@ class ReportProcess:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs, ExitStack() as unless_started:
                 unless_started.callback(ours.close)
-                self._process = self._start(MODULE, [str(self._run_dir), str(theirs.fileno())], [theirs.fileno()])
+                fd = theirs.fileno()
+                self._process = self._start(MODULE, [str(self._run_dir), str(fd)], [fd, *self._locks])
                 unless_started.pop_all()
             self._channel = ours
         return self._channel

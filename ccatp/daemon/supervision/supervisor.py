@@ -179,7 +179,7 @@ class SupervisedRun:
         self._failure = ""  # the death of a process that ended the run
         self._has_begun = False
         self._service = Service(*take_from(os.environ))
-        self._report = ReportProcess(self._start, run_dir)
+        self._report = ReportProcess(self._start, run_dir, run.locks)
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
         self._webhook = AlarmWebhook(cfg.alarms, run_dir.name, self._log, AlarmList(run_dir, self._log).alarms)
 
