@@ -78,6 +78,7 @@ class PioneerBase(BeaconDevice):
         self._new_counts: tuple[int, int] | None = None
         self._samples: list[WheelSpeeds] = []
         self._rates = 0.0, 0.0  # newest, right and left
+        self._own_mm_s = 0.0, 0.0  # the same by the base
         self._rest = [0.0, 0.0]
         self._set_points, self._sent_s = (0.0, 0.0), -inf
         self._ranges: dict[int, tuple[float, float]] = {}  # time, m
@@ -166,11 +167,14 @@ class PioneerBase(BeaconDevice):
         if not standard.is_enabled and now_s >= self._enable_s:
             # An operator has pressed STOP: only an operator switches the motors on again.
             self.stall = "its motors are off; press MOTORS on the base"
-        self._compare(standard)
+        self._own_mm_s = standard.right_mm_s, standard.left_mm_s
 
-    def _compare(self, standard: Standard) -> None:
-        """Count how often the encoders contradict the base's own speeds: a wrong sign or scale."""
-        for rate, own_mm_s in zip(self._rates, (standard.right_mm_s, standard.left_mm_s), strict=True):
+    def _compare(self) -> None:
+        """Count how often the encoders contradict the base's own speeds: a wrong sign or scale.
+
+        Once for new counts: after a stall of this program several packets of speeds come in one reading.
+        """
+        for rate, own_mm_s in zip(self._rates, self._own_mm_s, strict=True):
             if abs(own_mm_s) > _FAST_MM_S:
                 is_off = abs(1e3 * self._radius_m * rate - own_mm_s) > _DISAGREES * abs(own_mm_s)
                 self._doubts = min(self._doubts + 1, 40) if is_off else 0
@@ -189,6 +193,7 @@ class PioneerBase(BeaconDevice):
             return
         self._rates = rates
         self._samples.append((now_s, *self._rates))
+        self._compare()
 
     # -- the robot ----------------------------------------------------------------------------------------------------
 

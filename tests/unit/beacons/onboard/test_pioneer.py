@@ -207,6 +207,28 @@ def test_encoders_that_contradict_the_base_are_a_fault() -> None:
     assert rig.base.fault(rig.time.now_s).startswith("the encoders show impossible speeds; check their cables")
 
 
+def test_packets_that_come_at_once_after_a_stall_of_the_program_contradict_nothing(rig: Rig) -> None:
+    def stall(duration_s: float) -> None:
+        end_s = rig.time.now_s + duration_s
+        while rig.time.now_s < end_s:
+            rig.time.sleep(0.01)
+            rig.device.live()
+
+    rig.run(1.0, 2.0, 2.0)
+    rig.samples.clear()
+    while not rig.samples:
+        rig.run(0.01, 2.0, 2.0)
+    stall(0.14)  # a packet is read late, so that the wheels seem to turn too fast until the next one
+    rig.run(0.07, 2.0, 2.0)
+    assert abs((rig.samples[-1][1] or 0.0) - 2.0) > 1.0
+    stall(0.6)
+    for _ in range(20):
+        rig.run(0.01, 2.0, 2.0)
+        assert "contradict" not in rig.base.fault(
+            rig.time.now_s
+        )  # for good, because a robot that is held shows no speed
+
+
 def _set(**values: object) -> Callable[[Rig], FakePort]:
     def change(rig: Rig) -> FakePort:
         rig.device.__dict__.update(values)
