@@ -601,3 +601,11 @@ def test_the_limit_of_a_slide_has_been_named_after_a_slip(tmp_path: Path) -> Non
     assert load_config(file).health.grip_slide_m_s == 0.06
     file.write_text("[robot]\ngrip_slip_m_s = 0.06\n")
     assert load_onboard_config(file).robot.grip_slide_m_s == 0.06
+
+
+def test_the_shipped_robot_is_that_of_the_shipped_controller() -> None:
+    controller, robot = load_config().robot, load_onboard_config().robot
+    assert controller.edge_sensors_m == robot.edge_sensors_m
+    assert (controller.wheel_radius_m, controller.wheel_base_m) == (robot.wheel_radius_m, robot.wheel_base_m)
+    assert (0.0, 0.0, controller.puck_height_m) == robot.puck_m
+    assert controller.max_wheel_rad_s == robot.max_wheel_rad_s
