@@ -64,6 +64,7 @@ def end(onboard: Onboard, number: signal.Signals) -> float:
     return sent_s
 
 
+@pytest.mark.slow  # times of real processes, which other tests beside them spoil
 @pytest.mark.fault("B19")
 def test_the_base_stops_by_itself_after_the_program_was_killed(tmp_path: Path, measured: Measured) -> None:
     with Devices(tmp_path, "zigbee", EXACT, ONLY_BASE) as devices, Onboard(devices.config) as onboard:
@@ -77,6 +78,7 @@ def test_the_base_stops_by_itself_after_the_program_was_killed(tmp_path: Path, m
             devices.time_of("moves", killed_s + 0.7, 60.0)
 
 
+@pytest.mark.slow
 @pytest.mark.fault("B20")
 def test_the_base_stops_while_the_program_is_stopped_and_goes_on_with_it(tmp_path: Path, measured: Measured) -> None:
     with (

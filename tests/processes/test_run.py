@@ -143,7 +143,8 @@ def test_two_simulations_from_one_directory_have_their_own_processes_and_two_int
     tmp_path: Path, runtime_dir: Path
 ) -> None:
     env = os.environ | NO_REPORT | {"CCATP_RUNTIME_DIR": str(runtime_dir)}
-    command = [sys.executable, "-m", "ccatp", "run", "--sim", "--panels", "1", "--json", *NO_CALIBRATION]
+    # Many panels, so that no run ends before both are interrupted.
+    command = [sys.executable, "-m", "ccatp", "run", "--sim", "--panels", "9", "--json", *NO_CALIBRATION]
     pipe = subprocess.PIPE
     runs = [subprocess.Popen(command, cwd=tmp_path, env=env, stdout=pipe, stderr=pipe, text=True) for _ in range(2)]
     deadline_s, folders = time.monotonic() + 5.0 * DEADLINE_S, tmp_path / "runs"
