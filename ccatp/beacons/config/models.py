@@ -53,42 +53,42 @@ class BeaconRobotConfig(LinkConfig):
 class BeaconMissionConfig(Model):
     """What the robot is there for, and when that takes too long."""
 
-    laps: Annotated[int, Field(ge=1, le=1000)]  # how often all waypoints are visited
-    follow_s: Positive  # how long a target is followed
-    time_limit_s: Positive  # a mission that takes longer is held for an operator
+    laps: Annotated[int, Field(ge=1, le=1000)]
+    follow_s: Positive
+    time_limit_s: Positive
     verdict_timeout_s: SlowFreshness
-    settle_speed_m_s: Positive  # at rest: slower than this
-    map_period_s: Positive  # how often the map is published
+    settle_speed_m_s: Positive
+    map_period_s: Positive
 
 
 class BeaconDangerConfig(Model):
     """When the danger loop denies motion; distances from the vehicle's origin."""
 
-    obstacle_m: Positive  # no forward motion with anything ahead that is nearer
-    ahead_rad: Positive  # ahead: within this of the course
-    memory_s: Positive  # what was seen is believed for this long
-    target_m: Positive  # no motion towards the target when it is nearer
-    target_window_s: Positive  # its levels are averaged over this time
-    target_level_sigma_db: Positive  # of the white noise of its level
-    radio_timeout_s: Positive  # hold when no static radio, or no mote, was received for this long
-    position_sigma_m: Positive  # hold while the estimate's standard deviation is larger ...
-    position_clear_m: Positive  # ... until it is smaller than this
-    estimate_timeout_s: Positive  # hold without an estimate that is newer
-    hold_limit_s: Positive  # a hold that lasts longer needs an operator
-    stale_after_s: SlowFreshness  # no permit on frames that are older
+    obstacle_m: Positive
+    ahead_rad: Positive
+    memory_s: Positive
+    target_m: Positive
+    target_window_s: Positive
+    target_level_sigma_db: Positive
+    radio_timeout_s: Positive
+    position_sigma_m: Positive
+    position_clear_m: Positive
+    estimate_timeout_s: Positive
+    hold_limit_s: Positive
+    stale_after_s: SlowFreshness
 
 
 class ListenerConfig(Model):
     """How the robot receives ultrasonic motes."""
 
-    name: Name  # of the robot's own listener, in readings
-    pulses_per_frame: Annotated[int, Field(ge=1, le=20)]  # motes that send in one frame, one after the other
-    mapping_rounds: Annotated[int, Field(ge=1, le=10_000)]  # in which motes report what they receive of each other
-    gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]  # a range less likely than this is not used
+    name: Name
+    pulses_per_frame: Annotated[int, Field(ge=1, le=20)]
+    mapping_rounds: Annotated[int, Field(ge=1, le=10_000)]
+    gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]
 
 
 class SimBeaconRobotConfig(Model):
-    """The DataLoop: the robot's stand-in."""
+    """The simulated robot."""
 
     host: Host
     port: Port
@@ -96,7 +96,7 @@ class SimBeaconRobotConfig(Model):
 
 
 class RadioLossConfig(Model):
-    """Radios fall silent."""
+    """Radios send nothing."""
 
     type: Literal["radio_loss"]
     at_s: NonNegative
@@ -105,7 +105,7 @@ class RadioLossConfig(Model):
 
 
 class ObstacleIncidentConfig(Model):
-    """Something is put in the way, and taken away again."""
+    """An obstacle is added, and removed at the end."""
 
     type: Literal["obstacle"]
     at_s: NonNegative
@@ -116,7 +116,7 @@ class ObstacleIncidentConfig(Model):
 
 
 class TargetApproachConfig(Model):
-    """The radio that moves comes straight at the robot."""
+    """The radio that moves approaches the robot in a straight line."""
 
     type: Literal["target_approach"]
     at_s: NonNegative
@@ -244,7 +244,7 @@ class WorkspaceConfig(Model):
 
     size_m: tuple[Positive, Positive]
     waypoints_m: Annotated[tuple[Pair, ...], Field(min_length=1)]
-    loops: bool  # begin again with the first waypoint after the last
+    loops: bool
 
 
 class VehicleConfig(Model):
@@ -365,7 +365,7 @@ class FollowConfig(Model):
 
 
 class AvoidanceConfig(Model):
-    """Going round what the distance sensors see."""
+    """Driving around what the distance sensors detect."""
 
     is_active: bool
     sensors_rad: tuple[Angle, ...]

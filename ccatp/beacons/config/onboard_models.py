@@ -34,7 +34,7 @@ class BeaconBodyConfig(Model):
 
     wheel_radius_m: WheelRadius
     track_m: WheelBase
-    axle_distance_m: Positive  # of a robot with two driven wheels: not used, the same as vehicle.wheelbase_m
+    axle_distance_m: Positive
     max_wheel_rad_s: Positive
     loop_hz: Annotated[float, Field(ge=20.0, le=1000.0)]
 
@@ -42,9 +42,9 @@ class BeaconBodyConfig(Model):
 class ScanTimesConfig(Model):
     """When the robot stands and listens to radios."""
 
-    every_s: NonNegative  # between two scans; 0: never
-    standing_s: Positive  # the wheels must stand for this long before
-    standing_rad_s: Positive  # wheels that turn more slowly stand
+    every_s: NonNegative
+    standing_s: Positive
+    standing_rad_s: Positive
 
 
 class RadioDeviceConfig(Model):
@@ -54,7 +54,7 @@ class RadioDeviceConfig(Model):
     device: Text
     baud: Baud
     api_mode: Literal[1, 2]
-    names: tuple[Name, ...]  # node identifiers of the radios; empty: all that are found
+    names: tuple[Name, ...]
     discovery_s: Positive
     answer_timeout_s: Positive
     tries: Annotated[int, Field(ge=1, le=20)]
@@ -67,15 +67,15 @@ class DishConfig(Model):
     gpio_chip: Text
     step_line: Line
     direction_line: Line
-    left_is_high: bool  # level of the direction line for a turn to the left, seen from above
+    left_is_high: bool
     homing: Literal["switch", "hand"]
     switch_line: Line
     switch_is_high: bool
     steps_per_turn: Annotated[int, Field(ge=4, le=100_000)]
     positions: Annotated[int, Field(ge=4, le=720)]
-    step_s: Positive  # between two steps
-    settle_s: NonNegative  # after the last step to a position
-    tolerance_steps: Annotated[int, Field(ge=0)]  # by which the end switch may be missed
+    step_s: Positive
+    settle_s: NonNegative
+    tolerance_steps: Annotated[int, Field(ge=0)]
 
 
 class BaseDeviceConfig(Model):
@@ -85,7 +85,7 @@ class BaseDeviceConfig(Model):
     device: Text
     baud: Baud
     timeout_s: Positive
-    counts_per_mm: Positive  # of an encoder, for the travel of its wheel
+    counts_per_mm: Positive
     acceleration_m_s2: Positive
     turn_acceleration_rad_s2: Positive
     most_watchdog_s: Positive
@@ -93,7 +93,7 @@ class BaseDeviceConfig(Model):
     battery_full_v: Positive
     sonars: tuple[Annotated[int, Field(ge=0, le=31)], ...]  # numbers, in the order of sonars_rad
     sonars_rad: tuple[Angle, ...]
-    sonar_max_m: Positive  # what a sonar without an echo reads
+    sonar_max_m: Positive
     sonar_timeout_s: Positive
 
 
@@ -103,8 +103,8 @@ class ListenersConfig(Model):
     is_used: bool
     devices: dict[ListenerName, Text]
     baud: Baud
-    timeout_s: Positive  # a listener without a line for longer is reported
-    temperature_c: Celsius  # of a mote whose thermometer is off
+    timeout_s: Positive
+    temperature_c: Celsius
 
 
 class BeaconDevicesConfig(Model):
