@@ -41,7 +41,7 @@ OBSTACLE_AHEAD = near("obstacle_ahead", Owner.DANGER, 610, GROUP, "an obstacle a
     "An echo is nearer than `danger.obstacle_m` on the course. Code 1.", "Nothing: the robot drives around it.")
 TARGET_NEAR = near("target_near", Owner.DANGER, 620, GROUP, "the target is too near",
     "By its level, the followed radio is nearer than `danger.target_m`. Code 1.",
-    "Nothing: the robot waits until it is farther away.")
+    "Nothing: the robot backs off, if it can.")
 OBSTACLE_BEHIND = near("obstacle_behind", Owner.DANGER, 630, GROUP, "an obstacle behind",
     "An echo is nearer than `danger.obstacle_m` behind the robot: no reverse. Code 1.", "Nothing.")
 FRAMES_MISSED = fault("frames_missed", Owner.MISSION, ALONE, GROUP,

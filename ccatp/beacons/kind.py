@@ -45,7 +45,7 @@ BEACONS = MissionKind(
             "estimators on recorded runs among beacons, from several starts",
         ),
         "traits": (f"{_STUDIES}.traits:STUDY", "estimators on simulated runs with traits of real recordings"),
-        "damage": (f"{_STUDIES}.damage:STUDY", "the filter on damaged recordings: recovered, reported or wrong"),
+        "damage": (f"{_STUDIES}.damage:STUDY", "causal estimators on damaged recordings: recovered, reported or wrong"),
     },
     races=Part("ccatp.beacons.studies.bench_cases:races"),
 )

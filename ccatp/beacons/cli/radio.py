@@ -29,30 +29,33 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 @click.argument("path", type=common.PATH)
 @click.option(
     "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv", "columns", "pyfg", "bag")),
-    help="Format of the data; found out if not given.",
+    help="Format of the data; detected if not given.",
 )  # fmt: skip
-@click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
+@click.option(
+    "--robot", type=click.IntRange(min=1), metavar="N",
+    help="Robot of an MRCLAM set; by default that of the named file, or the first.",
+)  # fmt: skip
 @click.option(
     "--filter", "filter_name", type=click.Choice(FILTERS), default="fixed-lag", show_default=True,
-    help="fixed-lag: at each instant from readings up to it, which are linearised again, and once more some seconds "
-    "later; ekf-slam: each reading is linearised once; smoother: from all of them.",
+    help="ekf-slam: a filter, which linearises each reading once; fixed-lag: readings of the last minutes are "
+    "linearised again, and the path is also estimated some seconds later; smoother: from all readings of the run.",
 )  # fmt: skip
 @common.CONFIG_OPTION
 @common.settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
 @click.option(
-    "--keep-heading", is_flag=True, help="Use a heading of the truth that is turned against its course as it is."
+    "--keep-heading", is_flag=True, help="Do not correct a heading of the truth that is turned against its course."
 )
 @click.option(
     "--map", "map_file", type=common.PATH, help="Known places of beacons: the vehicle is localized among them."
 )
 @click.option("--start", metavar="X,Y,HEADING", help="First pose, in place of that of the truth: m, m, rad.")
-@click.option("--topics", "topics_file", type=common.PATH, help="Of a ROS bag: a TOML file that names its topics.")
+@click.option("--topics", "topics_file", type=common.PATH, help="TOML file that names the topics of a ROS bag.")
 @common.figure_option("Draw map, path and residuals")
 @click.option(
     "--tum",
     "tum_file",
     type=common.OutputFile(),
-    help="Write the path as evo reads it; the truth to NAME_truth beside it.",
+    help="Write the path in the TUM format of evo, and the truth to NAME_truth beside it.",
 )
 @click.option(
     "--out",
@@ -61,7 +64,7 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
     metavar="DIR",
     help="Write path, map, readings with innovations, and a factor graph.",
 )
-@click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
+@click.option("--peers", is_flag=True, help="Compare all our estimators with those of GTSAM; needs ccatp[peers].")
 @common.JSON_OPTION
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
@@ -148,7 +151,9 @@ _flag = partial(common.key_option, is_flag=True, flag_value=True, default=None)
     name="map",
 )
 @common.CONFIG_OPTION
-@click.option("--ranges", "ranges_file", type=common.PATH, help="Measured ranges (CSV) in place of simulated ones.")
+@click.option(
+    "--ranges", "ranges_file", type=common.PATH, help="Measured ranges (CSV or .xlsx) in place of simulated ones."
+)
 @click.option(
     "--cricket", "crickets", multiple=True, metavar="[NAME=]PATH",
     help="Serial line of a listening Cricket mote, recorded in a file or live from its device; one for each listener.",
@@ -157,13 +162,15 @@ _flag = partial(common.key_option, is_flag=True, flag_value=True, default=None)
     "--seconds", type=click.FloatRange(min=0.1, max=86_400.0), default=60.0, show_default=True, metavar="S",
     help="How long a device of --cricket is read.",
 )  # fmt: skip
-@click.option("--tags", "tags_file", type=common.PATH, help="Places of tags on their trolley (CSV).")
-@click.option("--truth", "truth_file", type=common.PATH, help="True places (CSV) to compare with.")
+@click.option("--tags", "tags_file", type=common.PATH, help="Places of tags on their trolley (CSV or .xlsx).")
+@click.option("--truth", "truth_file", type=common.PATH, help="True places (CSV or .xlsx) to compare with.")
 @click.option(
     "--method", type=click.Choice(("ekf", "batch")), default="batch", show_default=True,
-    help="Filter, or all ranges at once.",
+    help="ekf: a filter over the ranges; batch: all ranges at once.",
 )  # fmt: skip
-@click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N", help="Simulated runs.")
+@click.option(
+    "--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N", help="Number of simulated runs."
+)
 @common.key_option("--seed", "run.seed", type=click.IntRange(min=0), metavar="N", help="Seed of the first run.")
 @_flag("--offset", "cricket.batch.estimates_offset", help="Estimate a common offset of the ranges.")
 @_flag("--scale", "cricket.batch.estimates_scale", help="Estimate a common scale of the ranges.")
@@ -185,9 +192,11 @@ def radio_map(
     if ranges_file is not None and crickets:
         raise click.UsageError("--cricket and --ranges are two sources of ranges; give one of them")
     if not is_measured and (tags_file is not None or truth_file is not None):
-        raise click.UsageError("--tags and --truth go with --ranges; a simulation knows both")
+        raise click.UsageError(
+            "--tags and --truth go with --ranges, --truth also with --cricket; not with a simulation"
+        )
     if is_measured and seeds > 1:
-        raise click.UsageError("--seeds is for simulated ranges; --ranges has been measured once")
+        raise click.UsageError("--seeds is for simulated ranges; measured ones are mapped once")
     from ccatp.beacons.config.load import load_radio_config
     from ccatp.beacons.cricket.measured_map import report_lines
 
@@ -278,7 +287,7 @@ def _progress(total: int, what: str = "runs") -> Callable[[int], None]:
 
 @click.group(cls=common.CommandGroup, epilog=common.example("ccatp radio slam recordings/Plaza2_.mat"))
 def radio() -> None:
-    """Robots among radio beacons: mapping them, finding the way by them."""
+    """Robots among radio beacons: recorded runs, maps of motes, signal levels."""
 
 
 for command in (slam, calibrate, fix, fuzzy, radio_map):

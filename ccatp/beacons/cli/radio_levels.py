@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 CONFIDENCE = 0.95
 _LEAST_DB = 0.3  # rounding to whole decibels has the standard deviation 1 / sqrt(12)
-SHEET_OPTION = click.option("--sheet", metavar="NAME", help="Sheet of the workbooks; the first if not given.")
+SHEET_OPTION = click.option("--sheet", metavar="NAME", help="Sheet of workbooks (.xlsx); the first if not given.")
 
 
 @common.command(
@@ -87,11 +87,11 @@ _MOST_POINTS = 250_000  # of the grid: a few megabytes for each beacon
 )
 @click.argument("path", type=common.PATH)
 @click.option("--fingerprints", type=common.PATH, help="Places and levels that calibrate each beacon.")
-@click.option("--path-loss", type=common.PATH, help="Distances and levels that calibrate all instead.")
+@click.option("--path-loss", type=common.PATH, help="In their place: distances and levels that calibrate all beacons.")
 @click.option("--beacon", "beacons", multiple=True, metavar="NAME=X,Y", help="Place of a beacon, m. Repeat for each.")
-@click.option("--exchange", metavar="NAME,NAME", help="Two beacons that PATH has exchanged.")
-@click.option("--room", metavar="X0,Y0,X1,Y1", help="Where the receiver may be, m; round the beacons if not given.")
-@click.option("--spacing", "spacing_m", type=float, default=0.1, show_default=True, help="Of the grid, m.")
+@click.option("--exchange", metavar="NAME,NAME", help="Two beacons whose names are exchanged in PATH.")
+@click.option("--room", metavar="X0,Y0,X1,Y1", help="Where the receiver may be, m; by default around the beacons.")
+@click.option("--spacing", "spacing_m", type=float, default=0.1, show_default=True, help="Spacing of the grid, m.")
 @SHEET_OPTION
 @common.figure_option("Draw it")
 @common.JSON_OPTION
@@ -227,7 +227,7 @@ def _fix_lines(result: dict[str, Any]) -> Iterator[str]:
 
 @common.command("ccatp radio fuzzy --figure speed.png", "ccatp radio fuzzy --at 0.3 0.5")
 @common.CONFIG_OPTION
-@common.SETTINGS_OPTION
+@common.settings_option("A key of the configuration, as in control.fuzzy.outputs.fast=0.2.")
 @click.option(
     "--at", nargs=2, type=float, multiple=True, metavar="M RAD", help="Speed at a distance and a heading error."
 )

@@ -25,7 +25,7 @@ class BeaconMapMessage(Message):
     target: BeaconEllipse | None  # the radio that is followed; None before it was received
     obstacles: list[tuple[float, float]]  # points of the room that the distance sensors measured recently
     waypoints: list[tuple[float, float]]
-    next_waypoint: int  # the present target, -1 for none
+    next_waypoint: int  # number of the current waypoint from 0, -1 for none
     distances: list[float]
     nis_sum: float  # of all readings so far
     nis_size: int  # their degrees of freedom

@@ -25,7 +25,7 @@ from ccatp.onboard.rules import HELD
 NEEDED = ("encoder_right", "encoder_left", "edge", "stall")
 _ON_LINK = (*NEEDED, "battery_low")
 _CORNER = (0.0, 0.0)  # reported place of the edge sensors, which it does not have
-# Pulses in a line, with the longest names: without and with a scan they have three and one quarter of the line's limit.
+# Pulses in a line: with the longest names three quarters of the line's limit, and beside a scan one quarter.
 _LINE_PULSES, _LINE_PULSES_OF_SCANS = 100, 35
 _NOTHING = ScanResult(None, [])
 
