@@ -87,7 +87,7 @@ _MOST_POINTS = 250_000  # of the grid: a few megabytes for each beacon
 )
 @click.argument("path", type=common.PATH)
 @click.option("--fingerprints", type=common.PATH, help="Places and levels that calibrate each beacon.")
-@click.option("--path-loss", type=common.PATH, help="In their place: distances and levels that calibrate all beacons.")
+@click.option("--path-loss", type=common.PATH, help="In place of --fingerprints: distances and levels of all beacons.")
 @click.option("--beacon", "beacons", multiple=True, metavar="NAME=X,Y", help="Place of a beacon, m. Repeat for each.")
 @click.option("--exchange", metavar="NAME,NAME", help="Two beacons whose names are exchanged in PATH.")
 @click.option("--room", metavar="X0,Y0,X1,Y1", help="Where the receiver may be, m; by default around the beacons.")
