@@ -13,7 +13,6 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import Moves, PanelResult, adjuster_places
 
 _SIGMAS = 4.0  # of a difference that noise does not make in the several hundred adjusters of a mirror
-_LEAST_SHARE = 0.5  # of a move, below which it was made in part
 
 
 class Step(NamedTuple):
