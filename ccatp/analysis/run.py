@@ -32,8 +32,8 @@ class Run(ABC):
     """A run: finished, in progress, killed or simulated in one process.
 
     ``summary``: the content of summary.json; ``None`` if the run did not come to its end, or not yet. ``warnings``: a
-    line for each part that is missing, damaged or left out. ``config``: its configuration. ``alarms``: a row for each
-    time that a condition was raised.
+    line for each part that is missing, damaged or not used. ``config``: its configuration. ``alarms``: a row for each
+    time that a condition was raised; its times are UTC and by the robot's clock.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Run(ABC):
     def samples(self, name: str) -> Table:
         """Samples of the sensors by their key on the robot link, as in ``samples("imu")``.
 
-        Raises ValueError: no such key. RunReadError: no recording can be read.
+        Raises ValueError: no such key, or a simulation that kept no samples. RunReadError: no recording can be read.
         """
         return samples(name, self.frames(), self.sample_kinds)
 

@@ -31,10 +31,11 @@ _TRACK = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SurveyRun(Run):
-    """The survey of a mirror. Times are mission time, except ``fixes["t_s"]``, which is by the robot's clock.
+    """The survey of a mirror. Times are mission time, except those of ``fixes`` and ``alarms``: by the robot's clock.
 
     ``points``: every planned point. ``fixes``: a row for each measured point. ``panels``: position and tilt of each
-    panel with measured points, NaN where they do not determine it. ``adjuster_moves``: what aligns it.
+    planned panel, NaN where its points do not determine it. ``adjuster_moves``: the moves that align the others.
+    ``warnings`` also has the doubts about the laser network and the alignment.
     """
 
     findings: Findings
@@ -54,7 +55,7 @@ class SurveyRun(Run):
 
     @cached_property
     def panels(self) -> Table:
-        """Position, tilt and moves of each panel that has measured points."""
+        """Position, tilt and moves of each planned panel; no rows without a measured point."""
         table = tables.all_panels_table(self.findings)
         return table_of_records(table.columns, table.rows)
 

@@ -1,4 +1,6 @@
-"""Geometry of a telescope mirror: surface, panels, rim, and the frames from the world to the robot. Pure.
+"""Geometry of a telescope mirror, the puck from lengths, the laser network, and the alignment of the panels. Pure.
+
+Frames:
 
 * *world*: inertial, origin at the intersection of the M1 boresight axis and the M2 elevation axis; z is the direction
   in which light enters: down when the telescope points to the zenith.

@@ -87,7 +87,7 @@ class MoveCheck(NamedTuple):
 
 
 def made_of(planned_m: float, measured_m: float, sigma_m: float) -> Made:
-    """The verdict on one move; a planned move within the noise is made unless something else is seen."""
+    """The verdict on one move; as planned is a measured move that differs from it by no more than noise."""
     limit = _SIGMAS * sigma_m
     if abs(measured_m - planned_m) <= limit:
         return Made.AS_PLANNED
@@ -105,8 +105,8 @@ def check_moves(
 ) -> tuple[MoveCheck, ...]:
     """Moves planned by the survey ``before``, and the change of the panels at their adjusters that ``after`` shows.
 
-    Five adjusters can be distinguished with nine points: the change has twist and bowl. ``errors``: those of the errors
-    common to the panels of a survey that differ between the surveys.
+    Nine points determine the moves of five adjusters: the change contains twist and bowl. ``errors``: those of the
+    errors common to the panels of a survey that differ between the surveys.
     """
     found = []
     for one, other in zip(before, after, strict=True):

@@ -147,7 +147,7 @@ class Judgement(NamedTuple):
     length found with probability 0.999, in the worst channel (infinite without redundancy). ``protection_m``: error of
     the position by an undetected fault of one channel, or of all (offset, scale) alike, with the noise.
     ``inconsistency_m``: error of the position that the contradiction allows. ``w``: standardised errors
-    by channel, of a fix without a contradiction whose lengths are new.
+    by channel, of a fix whose used lengths agree and are new.
     """
 
     solution: RangeSolution

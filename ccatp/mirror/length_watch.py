@@ -100,7 +100,7 @@ class LengthWatch:
     def add(
         self, w: Mapping[int, float], chi2: float, dof: int, constant: tuple[FloatArray, FloatArray]
     ) -> list[ChannelWarning]:
-        """Add a fix without a located fault; ``constant``: of ``NetworkCalibration``, in the order of the channels."""
+        """Add a fix whose used lengths agree; ``constant``: of ``NetworkCalibration``, in the order of the channels."""
         self._quiet = {channel: left - 1 for channel, left in self._quiet.items() if left > 1}
         values = np.array([w.get(channel, 0.0) for channel in self._channels])
         found = []

@@ -109,9 +109,10 @@ class Mirror:
             raise UnknownPanelError(f"{self.name} has no panel in row {panel[0]}, column {panel[1]}") from None
 
     def point_on_deck(self, pid: PointId) -> tuple[float, float]:
-        """Deck (x, y) of a measurement point (thesis fig. 2.2), m; raises ``UnknownPanelError``, also for its number.
+        """Deck (x, y) of a measurement point (thesis fig. 2.2), m.
 
-        The nominal offset in the panel's plane is projected on the surface along the panel's normal.
+        The nominal offset in the panel's plane is projected on the surface along the panel's normal. Raises
+        ``UnknownPanelError``: no such panel, or no such number of a point.
         """
         if not 1 <= pid.point <= POINTS_PER_PANEL:
             raise UnknownPanelError(f"measurement point {pid.point} of panel {pid[:2]}: numbers run from 1 to 9")

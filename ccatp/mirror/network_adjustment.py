@@ -2,12 +2,14 @@
 
 Every effect has the prior of the configuration. One that the lengths contradict gets a wide prior, ``moved`` (stepwise:
 the score test of each candidate, the most significant first). Candidates are the effects themselves, the same from
-some point on, and single lengths. Among them the test decides with a probability of a false finding per survey that is
-configured. If another candidate explains the lengths nearly as well, both get the wide prior, and both are named. An
-effect that is suspect only (chance ``_SUSPECT``) gets the wide prior, too, and is not named.
+some point on (but for the drift), and single lengths, which are not used if they are significant. The probability of a
+false finding per survey is half of the configured one. If another candidate explains the lengths nearly as well, both
+get the wide prior, and both are named. An effect that is suspect only (chance ``_SUSPECT``) gets the wide prior, too,
+and is not named.
 
-Errors of scale and drift that the test is too weak to find are larger than the noise of the panels. At the end each of
-the two has the mean of the usual and the wide prior, weighted by what the lengths say of it: ``prior_of_both``.
+Errors of scale and drift that are too small for the test are larger than the noise of the panels. At the end each of
+the two, if it was not found, has the mean of the usual and the wide prior, weighted by the probability of each with
+these lengths: ``prior_of_both``.
 
 The noise of the lengths is measured with all effects free, so that larger noise makes no findings.
 """

@@ -429,11 +429,11 @@ class AdjusterPlan(NamedTuple):
 class PanelResult:
     """Alignment of a panel: rigid fit (piston, m; tip, tilt, rad), also for a bent panel.
 
-    The adjusters can correct these without bending the panel, and their uncertainty is half of that in a fit with three
-    curvatures. ``is_kept`` (k,): the points that are not outliers. ``shape``, and ``bending`` (moves that also remove
-    twist and bowl), are None if there are too few points. ``alternatives``: other explanations of the deviations that
-    the points do not exclude; the covariances contain the differences. ``deciding``: the point at which the
-    explanations differ most, which measured again decides between them.
+    The adjusters can correct these without bending the panel; in a fit with three curvatures the sigma of the piston
+    would be more than twice as large. ``is_kept`` (k,): the points that are not outliers. ``shape``, and ``bending``
+    (moves that also remove twist and bowl), are None if there are too few points. ``alternatives``: other explanations
+    of the deviations that the points do not exclude; the covariances contain the differences. ``deciding``: the point
+    at which the explanations differ most; measured again, it decides between them.
     """
 
     panel: PanelId

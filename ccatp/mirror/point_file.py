@@ -1,8 +1,8 @@
 """Reads points of other instruments: CSV, and the text exports of laser trackers and photogrammetry.
 
-A line has a label, x, y, z, and one sigma or one for each axis. Separators are tabs, semicolons, commas or blanks;
-numbers may have a decimal comma and separators of thousands. A header may name columns in any order, and
-their units.
+A line has a label, x, y, z, and one sigma or one for each axis; label and sigmas may be missing. Separators are tabs,
+semicolons, commas or blanks; numbers may have a decimal comma and separators of thousands. A header may name columns in
+any order, and their units.
 """
 
 import csv

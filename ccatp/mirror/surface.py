@@ -10,7 +10,7 @@ from ccatp.core import FloatArray, Vector3
 
 
 class MirrorError(ValueError):
-    """Base of the errors of this package."""
+    """Base of the errors of a mirror's geometry."""
 
 
 class UnknownPanelError(MirrorError):
