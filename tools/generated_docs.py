@@ -52,7 +52,10 @@ ABOUT = {
         "the fans at full duty; on other mirrors it is only reported. A low battery sends it home on every mirror."
     ),
     Group.SURVEY: "Most of these hold the robot until an operator decides: resume, abort, or stop.",
-    BEACONS: "Missions of robots among radio beacons (`system` in the configuration).",
+    BEACONS: (
+        "Missions of robots among radio beacons (`system` in the configuration). They have no laser system: a hold, also "
+        "one of the conditions above, ends without a fix."
+    ),
     Group.STORAGE: "A fix counts once it is on the disk; the survey does not continue without it.",
     Group.OBSERVATORY: (
         "Code 2, latched until it is cleared by its id (`ccatp clear ID`), across restarts of processes and of the "
