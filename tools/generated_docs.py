@@ -53,8 +53,8 @@ ABOUT = {
     ),
     Group.SURVEY: "Most of these hold the robot until an operator decides: resume, abort, or stop.",
     BEACONS: (
-        "Missions of robots among radio beacons (`system` in the configuration). They have no laser system: a hold, also "
-        "one of the conditions above, ends without a fix."
+        "Missions of robots among radio beacons (`system` in the configuration). They have no laser system: a hold, "
+        "also one of the conditions above, ends without a fix."
     ),
     Group.STORAGE: "A fix counts once it is on the disk; the survey does not continue without it.",
     Group.OBSERVATORY: (
