@@ -22,7 +22,7 @@ from ccatp.daemon.supervision.process import open_log
 from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Alarm, FixMessage, SeverityName, TrackMessage
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.dashboard.survey_view import point_name, survey_points
-from ccatp.survey.engagement import Engagement, Faulted, Held, Kind, Over, Paused, Phase
+from ccatp.survey.engagement import Earthquake, Engagement, Faulted, Held, Kind, Over, Paused, Phase
 from ccatp.survey.events import DRIVING, MEASURING, SurveyOutcome
 from ccatp.survey.turn import turn_of
 from tests.support.browser import CHROMIUM
@@ -85,8 +85,8 @@ STATES = {
         Engagement(Faulted(), cause=BLOCKED), ("abort", "stop"), WHEEL_BLOCKED, (WHEEL_BLOCKED, BATTERY_LOW)
     ),
     "emergency": Shown(
-        Engagement(Held(), cause=EARTHQUAKE.cause(), interlock=True), ("pause", "abort", "stop", "clear"), EARTHQUAKE,
-        (EARTHQUAKE,), "earthquake",
+        Engagement(Held(), cause=EARTHQUAKE.cause(), earthquake=Earthquake.HELD),
+        ("pause", "abort", "stop", "clear"), EARTHQUAKE, (EARTHQUAKE,), "earthquake",
     ),
     "aborted": Shown(
         Engagement(Over(SurveyOutcome.AT_BASE), cause=EMERGENCY.cause(kind="weather")), (), EMERGENCY, (EMERGENCY,),

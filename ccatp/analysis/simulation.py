@@ -153,7 +153,7 @@ class _ObservedRun(SilRun):
     def _points(self) -> tuple[StoredPoint, ...]:
         measured = {one.point: one.fix.t_s for one in self.laser.measured}
         points = [planned_point(point, self.cfg.mirror.panels) for point in sorted(self.parts.points)]
-        skipped = self.mission.state.skipped
+        skipped = self.mission.state.points.skipped
         return tuple(
             one._replace(status="measured", t_s=measured[one.point])
             if one.point in measured

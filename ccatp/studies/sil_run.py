@@ -400,9 +400,9 @@ class SilRun:
     def _result(self, mission_time_s: float) -> SilResult:
         state, misalignments = self.mission.state, self.robot.world.misalignments
         injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
-        track, builder = self.trace.join(), self.trace.builder
+        points, track, builder = state.points, self.trace.join(), self.trace.builder
         is_complete = state.outcome is SurveyOutcome.COMPLETE
-        builder.set_mission(len(state.done), len(state.skipped), mission_time_s, is_complete=is_complete)
+        builder.set_mission(len(points.done), len(points.skipped), mission_time_s, is_complete=is_complete)
         builder.add_grip(self.thrust.friction, self.thrust.margin)
         builder.set_panels(self.laser.panel_fits(), injected)
         builder.set_unreliable(self.laser.unreliable_points())

@@ -79,14 +79,21 @@ class Settling(Phase, frozen=True, tag=True):
         return Settling(self.standstill.update(cfg, motion), rest_by_s)
 
 
+class RequestState(StrEnum):
+    """Whether a measurement is requested."""
+
+    DUE = "due"  # at the end of the measuring time
+    MADE = "made"  # and its result is still wanted
+    FAILED = "failed"  # request it again after another measuring time
+
+
 class Measuring(Phase, frozen=True, tag=True):
     """From rest to the end of a measurement, which is requested after standing for the measuring time."""
 
     standstill: Standstill = Standstill()
     rest_by_s: float | None = None  # deadline for standing still
     measure_at_s: float = 0.0  # end of the measuring time
-    is_requested: bool = False  # a measurement is requested and still wanted
-    is_repeated: bool = False  # the measurement failed: request it again after another measuring time
+    request: RequestState = RequestState.DUE
 
     kind, shown = Kind.WORK, MEASURING
 
@@ -99,18 +106,18 @@ class Measuring(Phase, frozen=True, tag=True):
         """One frame of the measuring time, which any motion restarts; and whether to request the measurement now."""
         t_s = motion.t_s
         measuring = replace(self, standstill=self.standstill.update(cfg, motion))
-        if measuring.is_repeated:
-            measuring = replace(measuring, is_repeated=False)._timed(t_s, measuring_time_s)
-        if not measuring.standstill.is_rest:
-            if measuring.is_requested:
-                measuring = replace(measuring, is_requested=False)._timed(t_s, measuring_time_s)
+        is_rest = measuring.standstill.is_rest
+        if measuring.request is RequestState.FAILED or (measuring.request is RequestState.MADE and not is_rest):
+            measuring = measuring._timed(t_s, measuring_time_s)
+        elif not is_rest:
             measuring = replace(measuring, measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S)
-        if measuring.is_requested or t_s < measuring.measure_at_s:
+        if measuring.request is RequestState.MADE or t_s < measuring.measure_at_s:
             return measuring, False
-        return replace(measuring, rest_by_s=None, is_requested=True), True
+        return replace(measuring, rest_by_s=None, request=RequestState.MADE), True
 
     def _timed(self, t_s: float, measuring_time_s: float) -> "Measuring":
-        return replace(self, measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S, rest_by_s=t_s + SETTLE_LIMIT_S)
+        measure_at_s = t_s + measuring_time_s - TIME_EPSILON_S
+        return replace(self, measure_at_s=measure_at_s, rest_by_s=t_s + SETTLE_LIMIT_S, request=RequestState.DUE)
 
 
 class ReturnHome(msgspec.Struct, frozen=True):

@@ -40,7 +40,7 @@ _BEGUN_S = 0.1
 _NO_ROUTE = Route((), (0.0,))
 
 
-class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=4, forbid_unknown_fields=True):
+class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=5, forbid_unknown_fields=True):
     """What a main loop saves for the next one: the state of the survey and the pose of the robot.
 
     Route and measured points are left out: the next loop plans the route again and reads the points from the mission's
@@ -81,7 +81,7 @@ class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=4, forbid_unk
             localizer.heading_sigma_rad,
             localizer.speed_m_s,
             localizer.rate_rad_s,
-            replace(state, route=_NO_ROUTE, done=()),
+            replace(state, route=_NO_ROUTE, points=replace(state.points, done=())),
             run_id,
         )
 
@@ -188,7 +188,7 @@ def slowed(cfg: Config, grip: GripForecast) -> Config:
 def take_over(cfg: Config, checkpoint: Checkpoint, event: TakenOver) -> SurveyParts:
     """The parts of a main loop that continues where another one ended. Raises as ``assemble``."""
     # The state knows the points that failed and those without time.
-    failed = () if event.is_new_run else (*checkpoint.state.failure_causes, *event.skipped)
+    failed = () if event.is_new_run else (*checkpoint.state.points.failed, *event.skipped)
     parts = assemble(cfg, (*event.measured, *failed), checkpoint)
     parts.mission.handle(event)
     return parts

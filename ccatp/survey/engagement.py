@@ -152,12 +152,12 @@ class Over(Phase, frozen=True, tag=True):
     kind, shown = Kind.OVER, DONE
 
 
-class Levels(NamedTuple):
-    """What the newest verdict says, for events between two frames."""
+class Earthquake(StrEnum):
+    """An earthquake that the observatory has not cleared."""
 
-    severity: Severity = Severity.NONE
-    is_latched: bool = False  # an emergency is latched
-    is_shaking: bool = False  # an earthquake
+    NONE = "none"
+    LATCHED = "latched"  # by the danger loop; the mission still leaves an edge
+    HELD = "held"  # it holds the mission; a retreat is still possible
 
 
 class Engagement(msgspec.Struct, frozen=True):
@@ -169,8 +169,9 @@ class Engagement(msgspec.Struct, frozen=True):
     phase: Phase = Ready()
     cause: Cause = NO_CAUSE  # why it is held, relocalizes, leaves an edge, goes home or has ended
     abort_cause: Cause = NO_CAUSE  # why it goes home, as soon as it may
-    interlock: bool = False  # held by an earthquake; a retreat is still possible
-    levels: Levels = Levels()
+    earthquake: Earthquake = Earthquake.NONE
+    severity: Severity = Severity.NONE  # of the newest verdict
+    is_latched: bool = False  # an emergency is latched, by the newest verdict
     is_slow: bool = False
     full_fans: bool = False  # full fans from now on
     emergency_epoch: int | None = 0  # the newest emergency acted on; None: take it from the first verdict
@@ -215,13 +216,17 @@ class Engagement(msgspec.Struct, frozen=True):
     @property
     def is_paused(self) -> bool:
         """Held until an operator resumes, or reports that an earthquake is over."""
-        return self.is_held_by_hand or (self.interlock and self.phase.kind is Kind.HELD)
+        return self.is_held_by_hand or self.is_shaken
+
+    @property
+    def is_shaken(self) -> bool:
+        """Held until the observatory clears an earthquake."""
+        return self.earthquake is Earthquake.HELD and self.phase.kind is Kind.HELD
 
     @property
     def summary_state(self) -> SummaryState:
         """The phase in the words of an observatory."""
-        is_disabled = self.interlock and self.phase.kind is Kind.HELD
-        return SummaryState.DISABLED if is_disabled else _SUMMARY.get(self.phase.kind, SummaryState.ENABLED)
+        return SummaryState.DISABLED if self.is_shaken else _SUMMARY.get(self.phase.kind, SummaryState.ENABLED)
 
     @property
     def needs_fix(self) -> bool:
@@ -302,9 +307,9 @@ class EngagementRules(ABC, Generic[S]):
 
     def shake(self, s: S, cause: Cause) -> S:
         """Hold in an earthquake. Afterwards the robot relocalizes, because it may have slipped, and drives home."""
-        if s.interlock or s.kind is Kind.OVER:
+        if s.earthquake is Earthquake.HELD or s.kind is Kind.OVER:
             return s
-        s = self.lose_pose(replace(s, interlock=True, cause=cause, abort_cause=s.abort_cause or cause))
+        s = self.lose_pose(replace(s, earthquake=Earthquake.HELD, cause=cause, abort_cause=s.abort_cause or cause))
         if isinstance(s.phase, Held):
             return replace(s, phase=replace(s.phase, rejects_odometry=False))
         return enter(s, Event.SHAKE, Held())
@@ -357,8 +362,8 @@ class EngagementRules(ABC, Generic[S]):
             return s
         is_new = not s.abort_cause
         s = replace(s, abort_cause=s.abort_cause or cause)
-        if s.interlock:
-            return s  # it goes home when the interlock is released
+        if s.earthquake is Earthquake.HELD:
+            return s  # it goes home when that is cleared
         return self.proceed(s) if s.is_held or (is_new and not s.is_recovering) else s
 
     def finish(self, s: S, outcome: SurveyOutcome) -> S:
@@ -413,7 +418,7 @@ class EngagementRules(ABC, Generic[S]):
     def react(self, s: S, frame: Any, verdict: Verdict | None) -> S:
         """React to the verdict in force (``None``: none is fresh enough) in a frame at ``frame.t_s``."""
         if verdict is None or not _is_routine(s, verdict):
-            s = s if verdict is None else _with_levels(s, verdict)
+            s = s if verdict is None else _with_verdict(s, verdict)
             v = verdict or NO_FRESH_VERDICT
             for row in self.rows:
                 if row.applies(s, v):
@@ -438,16 +443,15 @@ def _is_of_main(cause: Cause) -> bool:
 
 
 def _resume_refusal(s: Engagement) -> str | None:
-    severity, is_latched, is_shaking = s.levels
     if not s.is_held:
         return f"the mission is not held but {s.mode}"
-    if s.interlock or is_shaking:
+    if s.earthquake is not Earthquake.NONE:
         return f"{EARTHQUAKE.message}: nothing moves until that is cleared"
-    if is_latched and not s.abort_cause:
+    if s.is_latched and not s.abort_cause:
         return "an emergency of before is latched: 'ccatp clear' it first"
-    if severity >= HOLD and severity is not RETURN:
+    if s.severity >= HOLD and s.severity is not RETURN:
         is_paused = s.cause.condition == OPERATOR.name  # danger's own finding is not in the state
-        what = f"danger has found a {severity.name.lower()}; see 'ccatp alarms'" if is_paused else text_of(s.cause)
+        what = f"danger has found a {s.severity.name.lower()}; see 'ccatp alarms'" if is_paused else text_of(s.cause)
         return f"the cause persists: {what}"
     return None
 
@@ -460,27 +464,29 @@ def _is_routine(s: Engagement, v: Verdict) -> bool:
         and v.code is EventCode.NORMAL
         and not (v.is_shaking or v.raised or v.full_fans)
     )
-    was_normal = s.levels == _NORMAL and not (s.interlock or s.located or s.is_slow)
+    was_normal = s.severity is NONE and s.earthquake is Earthquake.NONE
+    was_normal = was_normal and not (s.is_latched or s.located or s.is_slow)
     is_known = s.emergency_epoch is not None and not (isinstance(s.phase, Held) and s.phase.stuck_s is not None)
     return is_normal and was_normal and is_known and v.forward and v.reverse and v.turn
 
 
-_NORMAL = Levels()
-
-
-def _with_levels(s: S, v: Verdict) -> S:
+def _with_verdict(s: S, v: Verdict) -> S:
     """Store the parts of a verdict that later frames need."""
     epoch, full_fans = s.emergency_epoch, s.full_fans or v.full_fans or v.is_shaking
-    levels, interlock = Levels(v.severity, v.raised > 0, v.is_shaking), s.interlock and v.is_shaking
+    is_latched, earthquake = v.raised > 0, Earthquake.NONE
+    if v.is_shaking:
+        earthquake = Earthquake.HELD if s.earthquake is Earthquake.HELD else Earthquake.LATCHED
     located = s.located if v.severity >= HOLD else NO_CAUSE
-    if epoch is not None and (levels, full_fans, located, interlock) == (s.levels, s.full_fans, s.located, s.interlock):
+    new = v.severity, is_latched, full_fans, located, earthquake
+    if epoch is not None and new == (s.severity, s.is_latched, s.full_fans, s.located, s.earthquake):
         return s
     return replace(
         s,
-        levels=levels,
+        severity=v.severity,
+        is_latched=is_latched,
         full_fans=full_fans,
         located=located,
-        interlock=interlock,
+        earthquake=earthquake,
         emergency_epoch=v.raised if epoch is None else epoch,
     )
 

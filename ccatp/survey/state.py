@@ -8,11 +8,12 @@ import msgspec
 from ccatp.control.gate import Purpose
 from ccatp.control.tracker import LegPhase
 from ccatp.core import PointId, Stop
-from ccatp.survey.behaviours import Measuring, Retreat, ReturnHome, Settling
+from ccatp.survey.behaviours import Measuring, RequestState, Retreat, ReturnHome, Settling
 from ccatp.survey.budget import BudgetProgress
 from ccatp.survey.engagement import Engagement, Faulted, Held, Kind, Over, Paused, Phase, Ready
 from ccatp.survey.events import DRIVING, PURPOSES, RETURNING, TURNING, Mode
 from ccatp.survey.planning.route import Route
+from ccatp.survey.points import PointLog
 from ccatp.survey.route_follower import Leg
 
 
@@ -99,12 +100,7 @@ class SurveyState(Engagement, frozen=True, kw_only=True, omit_defaults=True, for
     inflates_covariance: bool = False  # the next command tells the localizer to inflate its covariance
     is_confirmed: bool = False  # a fix was taken since a way was found last
     recoveries_s: tuple[float, ...] = ()  # times of the recent divergences of the estimate
-    # Points and what was done for them.
-    done: tuple[PointId, ...] = ()  # measured, in order
-    skipped: tuple[PointId, ...] = ()  # their measurement failed
-    failure_causes: Mapping[PointId, str] = msgspec.field(default_factory=dict)  # only of points not measured since
-    due: tuple[PointId, ...] = ()  # to measure next, in this order, instead of the planned route
-    retried: frozenset[PointId] = frozenset()  # failed ones that have had their second try
+    points: PointLog = PointLog()
     arrived_at: PointId | None = None  # the last point with an arrival
     request: int = 0  # number of the last requested measurement
     corrections: int = 0
@@ -174,7 +170,7 @@ class SurveyState(Engagement, frozen=True, kw_only=True, omit_defaults=True, for
     @property
     def is_awaiting_fix(self) -> bool:
         """Whether the last requested measurement, number ``request``, is still wanted."""
-        return isinstance(self.phase, Measuring) and self.phase.is_requested
+        return isinstance(self.phase, Measuring) and self.phase.request is RequestState.MADE
 
     @property
     def eta_s(self) -> float:

@@ -17,6 +17,7 @@ from ccatp.survey.behaviours import (
     STILL,
     Measuring,
     MissionCommand,
+    RequestState,
     Retreat,
     RetreatStep,
     ReturnHome,
@@ -39,6 +40,7 @@ from ccatp.survey.failsafe import ROWS
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import Route, RoutePlanner
+from ccatp.survey.points import PointLog
 from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
 from ccatp.survey.state import (
     Corrected,
@@ -68,7 +70,7 @@ _LOST = 2.0
 
 # Fields of the state that another process keeps unchanged.
 _KEPT = (
-    *("abort_cause", "full_fans", "finding", "emergency_epoch", "retried", "corrections", "request", "failures"),
+    *("abort_cause", "full_fans", "finding", "emergency_epoch", "corrections", "request", "failures"),
     *("was_reverse", "backoffs"),
 )
 
@@ -98,15 +100,18 @@ class Survey(EngagementRules[SurveyState]):
     def begin(self, done: Sequence[PointId] = ()) -> SurveyState:
         """The state before the first frame; ``done``: points measured in earlier runs."""
         pose = Unconfirmed() if self.cfg.mission.fix_at_start else Located()
-        return SurveyState(route=self._route, pose=pose, done=tuple(done))
+        return SurveyState(route=self._route, pose=pose, points=PointLog(tuple(done)))
 
     def left_out(self, s: SurveyState) -> dict[PointId, str]:
         """Points that were skipped, or will not be measured any more, with the reason."""
-        out = dict(s.failure_causes)
+        out = s.points.causes
         if s.kind is Kind.OVER:
             # What held the robot when an operator stopped it is not why the mission ended.
             is_stopped = s.outcome is SurveyOutcome.STOPPED
-            why, over = "stopped by an operator" if is_stopped else text_of(s.cause) or str(s.outcome), {*s.done, *out}
+            why, over = (
+                "stopped by an operator" if is_stopped else text_of(s.cause) or str(s.outcome),
+                {*s.points.done, *out},
+            )
             out |= {point: why for point in self._points if point not in over}
         return out
 
@@ -172,18 +177,11 @@ class Survey(EngagementRules[SurveyState]):
             # The way home is planned again from where the robot is now.
             return enter(replace(s, cause=s.abort_cause), Event.GO_HOME, Returning())
         if s.stop is None:
-            s = self._begin_second_round(s)
-            if not s.due:
+            points = s.points if s.points.due else s.points.begin_second_round()
+            if not points.due:
                 return self.finish(s, SurveyOutcome.COMPLETE)
+            s = replace(s, points=points, course=OffRoute())
         return enter(replace(s, cause=NO_CAUSE), Event.GO_ON, Travel())
-
-    def _begin_second_round(self, s: SurveyState) -> SurveyState:
-        """Failed points that were not tried again yet are due; the last first, because the robot is nearest to it."""
-        due, retried = s.due, s.retried
-        if not due:
-            due = tuple(point for point in reversed(tuple(s.failure_causes)) if point not in retried)
-            retried = retried.union(due)
-        return replace(s, due=due, retried=retried, course=OffRoute() if due else s.course)
 
     def change_speed(self, s: SurveyState, *, is_slow: bool) -> SurveyState:
         """Reduce the speed now, or return to the usual speed with the next leg."""
@@ -329,14 +327,14 @@ class Survey(EngagementRules[SurveyState]):
         return replace(s, course=OnRoute() if is_safe else OffRoute())
 
     def _find_route(self, s: SurveyState, motion: StateEstimate) -> Step:
-        stop, deck, due, command = s.stop, self.follower.deck_pose(motion), s.due[:CHUNK], HOLD_POSITION
+        stop, deck, due, command = s.stop, self.follower.deck_pose(motion), s.points.due[:CHUNK], HOLD_POSITION
         if stop is not None and stop.kind is StopKind.CALIBRATE:
             if is_on_drive(s.route.stops, deck.x_m, deck.y_m):
                 # Still on the calibration drive: continue it.
                 return replace(s, course=OnRoute()), command
             command = replace(command, skips_calibration=True)
         try:
-            planner, over = self.planner, {*s.done, *s.skipped}
+            planner, over = self.planner, {*s.points.done, *s.points.skipped}
             route = planner.route(deck, due) if due else planner.rejoin(s.route, deck, over)
         except PlanError as error:
             return self._without_way(s, conditions.NO_WAY_ON.cause(why=error)), command
@@ -350,7 +348,7 @@ class Survey(EngagementRules[SurveyState]):
         if budget is None:
             return s, True
         rest = s.route.stops[s.stop_index :]
-        left: Sequence[PointId] = s.due or [stop.point for stop in rest if stop.point is not None]
+        left: Sequence[PointId] = s.points.due or [stop.point for stop in rest if stop.point is not None]
         deck = self.follower.deck_pose(motion)
         progress = budget.progress(s.budget, deck, left)
         going_on = budget.review(progress, motion.t_s, deck, left)
@@ -361,9 +359,8 @@ class Survey(EngagementRules[SurveyState]):
         if going_on is left:
             return s, True
         dropped = set(left).difference(going_on)
-        causes = {**s.failure_causes, **{point: "no time for it" for point in left if point in dropped}}
-        due = tuple(going_on)
-        return replace(s, due=due, failure_causes=causes, retried=s.retried | dropped, course=OffRoute()), True
+        points = s.points.give_up([point for point in left if point in dropped], "no time for it", going_on)
+        return replace(s, points=points, course=OffRoute()), True
 
     # -- standing -----------------------------------------------------------------------------------------------------
 
@@ -448,19 +445,14 @@ class Survey(EngagementRules[SurveyState]):
             if s.kind is Kind.OVER and s.outcome is not SurveyOutcome.STOPPED:
                 s = self.begin()
             budget = BudgetProgress(is_review_due=s.budget.is_review_due)
-            s = replace(s, failure_causes={}, due=(), retried=frozenset(), failures=0, budget=budget)
-        # The database is newer than the state.
-        failed = {point: "not measured" for point in skipped if point not in s.failure_causes}
+            s = replace(s, points=PointLog(), failures=0, budget=budget)
         held = Faulted() if s.is_faulted and not is_new_run else Paused()
         return SurveyState(
             route=self._route,
             phase=held if s.is_held_by_hand else Ready(),
             cause=s.cause if s.is_held_by_hand else NO_CAUSE,
             pose=Lost(MOST_LEGS),
-            done=measured,
-            skipped=skipped,
-            failure_causes={p: why for p, why in {**s.failure_causes, **failed}.items() if p not in measured},
-            due=tuple(point for point in s.due if point not in failed and point not in measured),
+            points=s.points.take_over(measured, skipped),
             budget=s.budget._replace(begun_s=None, before_s=elapsed_s),
             **{name: getattr(s, name) for name in _KEPT},
         )
@@ -484,7 +476,10 @@ class Survey(EngagementRules[SurveyState]):
     def _fixed(self, s: SurveyState, event: FixStored) -> SurveyState:
         s, point = replace(s, failures=0), event.point
         if point is not None:
-            return self._leave_stop(s, point, event.heading_sigma_rad, is_measured=True)
+            is_new = point not in s.points.done
+            return self._leave_stop(
+                replace(s, points=s.points.measure(point)), point, event.heading_sigma_rad, is_new=is_new
+            )
         if not s.needs_fix:
             return self._leave_pointless(s, event.heading_sigma_rad)
         # The heading has to be certain before the robot drives on.
@@ -506,12 +501,12 @@ class Survey(EngagementRules[SurveyState]):
             if failures >= limit:
                 return self.meet(s, conditions.NOT_FOUND.cause(why=cause))
             if isinstance(s.phase, Measuring):  # this fix is needed; the robot may not have stood quite still
-                s = replace(s, phase=replace(s.phase, is_requested=False, is_repeated=True))
+                s = replace(s, phase=replace(s.phase, request=RequestState.FAILED))
             return s
-        s = replace(s, failure_causes={**s.failure_causes, point: cause}, due=_without(s.due, point))
+        is_new, s = point not in s.points.skipped, replace(s, points=s.points.fail(point, cause))
         if failures >= limit:
             s = self.meet(s, conditions.MEASUREMENTS_FAILED.cause(count=limit, why=cause))
-        return self._leave_stop(s, point, sigma_rad, is_measured=False)
+        return self._leave_stop(s, point, sigma_rad, is_new=is_new)
 
     def _leave_pointless(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:
         """Continue after a fix, or a failed fix, at a stop without a point."""
@@ -528,20 +523,13 @@ class Survey(EngagementRules[SurveyState]):
             return replace(s, pose=Lost(MOST_LEGS), phase=phase)
         return s
 
-    def _leave_stop(
-        self, s: SurveyState, point: PointId, heading_sigma_rad: float, *, is_measured: bool
-    ) -> SurveyState:
+    def _leave_stop(self, s: SurveyState, point: PointId, heading_sigma_rad: float, *, is_new: bool) -> SurveyState:
+        """Continue after a point is measured, or failed; ``is_new``: it was not so before."""
         goes_on, stop = s.is_awaiting_fix, s.stop
         # A pause, and a new route to the point, may come while the fix is being stored. The fix counts all the same.
         is_here = stop is not None and stop.point == point
-        if is_here or point not in (s.done if is_measured else s.skipped):
-            s = replace(s, skipped=_without(s.skipped, point), backoffs=0)
-            s = replace(s, budget=s.budget._replace(is_review_due=self._budget is not None))
-            if is_measured:
-                causes = {other: why for other, why in s.failure_causes.items() if other != point}
-                s = replace(s, done=(*s.done, point), failure_causes=causes, due=_without(s.due, point))
-            else:
-                s = replace(s, skipped=(*s.skipped, point))
+        if is_here or is_new:
+            s = replace(s, backoffs=0, budget=s.budget._replace(is_review_due=self._budget is not None))
             if not is_here:
                 s = replace(s, course=OffRoute())  # the planned route leads to the point again
             elif isinstance(s.phase, Travel):
@@ -560,10 +548,6 @@ def _leg_of(phase: SurveyPhase) -> Leg | None:
 
 def _on_leg(s: SurveyState, leg: Leg) -> SurveyState:
     return replace(s, phase=replace(s.phase, leg=leg)) if isinstance(s.phase, OnLeg) else s
-
-
-def _without(points: tuple[PointId, ...], point: PointId) -> tuple[PointId, ...]:
-    return tuple(other for other in points if other != point) if point in points else points
 
 
 class Mission(EngagedMission[SurveyState]):

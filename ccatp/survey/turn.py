@@ -20,7 +20,7 @@ from ccatp.links.channels import OperatorCommand
 from ccatp.links.topics import MissionStatus, Turn
 from ccatp.safety.emergency_latch import AT_BASE_OR_HELD
 from ccatp.survey.ending import end_text, ending_of
-from ccatp.survey.engagement import MOVING, EngagedMission, Engagement, Kind
+from ccatp.survey.engagement import MOVING, Earthquake, EngagedMission, Engagement, Kind
 from ccatp.survey.events import (
     BACKING_OFF,
     DRIVING,
@@ -72,7 +72,7 @@ def offers_of(mission: EngagedMission[Any]) -> tuple[str, ...]:
         is_needed = name is not OperatorCommand.RESUME or s.is_held_by_hand
         if after is not None and is_needed and (after.phase != s.phase or after.abort_cause != s.abort_cause):
             made.append(str(name))
-    if s.levels.is_latched and str(s.mode) in AT_BASE_OR_HELD:
+    if s.is_latched and str(s.mode) in AT_BASE_OR_HELD:
         made.append(CLEAR)
     return tuple(made)
 
@@ -89,7 +89,7 @@ def turn_of(
     def turn(actor: Actor, action: Next, why: Cause, bars: Cause = NO_CAUSE) -> Turn:
         return Turn(kind=s.kind, actor=actor, next=action, why=why, bars=bars, offers=offers, resumes=resumes)
 
-    is_shaking = s.interlock or s.levels.is_shaking
+    is_shaking = s.earthquake is not Earthquake.NONE
     why = s.cause or waits or found
     match s.kind:
         case Kind.OVER:
@@ -119,7 +119,7 @@ def _of_operator(s: Engagement, offers: tuple[str, ...]) -> tuple[Actor, Next]:
     """What ends a hold that an operator has to end."""
     if OperatorCommand.RESUME in offers:
         return Actor.OPERATOR, Next.RESUME
-    is_latched = s.levels.is_latched and not s.abort_cause
+    is_latched = s.is_latched and not s.abort_cause
     return (Actor.OBSERVATORY, Next.CLEAR) if is_latched else (Actor.OPERATOR, Next.HANDS)
 
 

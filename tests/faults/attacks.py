@@ -135,7 +135,7 @@ class AttackedSurvey(SilRun):
             wrong.append(f"a sensor hangs {1e3 * self._worst_out_m:.1f} mm over the rim")
         if self.robot.world.is_fallen:
             wrong.append("fallen")
-        is_complete = state.mode is DONE and not state.skipped
+        is_complete = state.mode is DONE and not state.points.skipped
         return Result(one, is_complete, text_of(state.cause), wrong)
 
 

@@ -71,7 +71,7 @@ class Broken(MeasuredSurvey):
         self.drive = drive.right_rad_s, drive.left_rad_s
 
     def look(self, frame: Sensors) -> None:
-        if self.broken_at_s is None and self.mission.state.done and self.mission.state.mode is Mode.DRIVING:
+        if self.broken_at_s is None and self.mission.state.points.done and self.mission.state.mode is Mode.DRIVING:
             self.broken_at_s = frame.t
             localizer: Any = self.localizer
             # The end of a block of frames: the filter is asked in this one.
@@ -159,7 +159,7 @@ def restarted(seed: int, **overrides: object) -> Config:
 
 def check(rehearsal: RestartedSurvey) -> None:
     result = rehearsal.run()
-    measured = rehearsal.mission.state.done
+    measured = rehearsal.mission.state.points.done
     assert result.outcome == "complete", result.cause
     assert rehearsal.states, "nobody was killed"
     assert len(measured) == len(set(measured)) == 9

@@ -184,7 +184,7 @@ def test_sensors_with_wrong_time_stamps_hold(signals: tuple[str, ...], by_s: flo
     run = watched(HARD, held(HOLD), *each(signals, f"delayed at_s=0.0 by_s={by_s} stamps='fresh'"))
     last = run.seen[-1]
     assert last.verdict.severity is Severity.HOLD
-    assert not run.mission.state.done
+    assert not run.mission.state.points.done
     if signals is INERTIAL:  # encoders that are late also disagree with the set points
         assert last.verdict.cause.condition == TURN_TIMES_DIFFER.name
         assert last.verdict.limit < last.verdict.value < by_s + 0.015  # a lower bound: turns hardly last longer
@@ -432,7 +432,7 @@ def test_a_clock_that_wraps_does_not_count_in_the_mission_time(phase_s: float) -
     run = watched(HARD, after(12.0), f"clock wrap at_s=0.0 modulo_s={DRIVING_S + phase_s}")
     assert not run.mission.state.is_faulted
     assert run._time.offset_s == pytest.approx(DRIVING_S + phase_s, abs=0.011)  # one period, and one wrap only
-    assert len(run.mission.state.done) >= 2
+    assert len(run.mission.state.points.done) >= 2
 
 
 # -- what passes by ----------------------------------------------------------------------------------------------------
@@ -451,7 +451,7 @@ def test_a_clock_that_wraps_does_not_count_in_the_mission_time(phase_s: float) -
 def test_what_is_over_soon_does_not_end_the_mission(fault: str, until_s: float, done: int) -> None:
     run = watched(HARD, after(until_s), fault)
     assert not run.mission.state.is_faulted
-    assert len(run.mission.state.done) >= done
+    assert len(run.mission.state.points.done) >= done
     assert max(map(error_m, run.since(TURNING_S))) < 0.02 or not fault.startswith("imu")
 
 

@@ -89,14 +89,14 @@ def test_points_that_fail(
     run = MeasuredSurvey(SURVEY, tmp_path, laser)
     result = run.run()
     assert result.outcome == outcome
-    assert (len(run.mission.state.done), len(run.mission.state.skipped)) == (measured, skipped)
+    assert (len(run.mission.state.points.done), len(run.mission.state.points.skipped)) == (measured, skipped)
     assert len(run.all_fixes) == result.summary["points"]["measured"] == measured
     assert result.summary["points"]["skipped"] == skipped
-    assert {point for point, status in run.stored if status == "skipped"} == set(run.mission.state.skipped)
+    assert {point for point, status in run.stored if status == "skipped"} == set(run.mission.state.points.skipped)
     if outcome == "complete":
         assert list(run.mission.survey.left_out(run.mission.state).values()) == why
         assert len([m for m in run.asked if is_point(m, *points)]) == 2  # not again and again
-        assert run.mission.state.done[-1] == failures[0].point or why  # when all others were done
+        assert run.mission.state.points.done[-1] == failures[0].point or why  # when all others were done
     else:
         assert run.mission.state.is_faulted
         assert run.mission.state.mode is Mode.HELD
@@ -470,8 +470,8 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(
                         point, here = story.state.measuring_point, story.deck()
                         service.begin(FixRequest(story.state.request, story.t, point, (0.0, 0.0, 0.0), here))
                     await asyncio.sleep(0.01)
-                    if len(story.state.done) > done:
-                        done, counted = len(story.state.done), counted + 1
+                    if len(story.state.points.done) > done:
+                        done, counted = len(story.state.points.done), counted + 1
                         begun_s, taken_s = fused[-1]
                         moving += any(begun_s - 0.2 <= t <= taken_s for t in motion_s)
                 assert story.state.mode is Mode.DONE

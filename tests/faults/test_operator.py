@@ -74,7 +74,7 @@ class Aborted(MeasuredSurvey):
         self.moved_while_held = self.was_permitted = False
 
     def look(self, frame: Sensors) -> None:
-        if self.raised_s == inf and self.mission.state.done and self.mission.state.mode is self._at:
+        if self.raised_s == inf and self.mission.state.points.done and self.mission.state.mode is self._at:
             self.raised_s = frame.t
             assert self.monitor.emergency(self._kind, "e") is None
         if self.cleared_s == inf and frame.t - self.raised_s >= self._clear_after_s:
@@ -107,7 +107,7 @@ def test_a_fire_stops_the_wheels_and_leads_home(state: Mode, tmp_path: Path, mea
     assert (result.outcome, result.cause) == ("aborted, at base", "emergency: fire")
     assert run.fans == []
     left_out = run.mission.survey.left_out(run.mission.state)
-    assert len(left_out) + len(run.mission.state.done) == 9
+    assert len(left_out) + len(run.mission.state.points.done) == 9
     assert set(left_out.values()) == {"emergency: fire"}
 
 
@@ -154,7 +154,7 @@ def test_during_an_earthquake_resume_is_refused(story: Story) -> None:
     assert story.mission.handle(Abort(Cause("operator"))) is None
     assert story.state.mode is HELD
     story.until_state(DONE)  # it is over
-    assert story.state.done == ()
+    assert story.state.points.done == ()
 
 
 @pytest.mark.fault("O1", "O3")
@@ -190,7 +190,7 @@ def test_what_breaks_in_an_earthquake_waits_for_an_operator_when_it_is_over(stor
     assert story.state.cause == GRIP_TOO_LITTLE.cause()
     assert story.mission.handle(Resume()) is None
     story.until_state(DONE)
-    assert story.state.done == ()
+    assert story.state.points.done == ()
 
 
 @pytest.mark.fault("O1")
@@ -249,7 +249,7 @@ def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
     assert story.t - begun_s <= 2.0
     assert all(order.twist.v_m_s <= 0.0 for order in story.orders[first:])
     story.until_state(DONE)
-    assert story.state.done == ()
+    assert story.state.points.done == ()
 
 
 def drive(config: Config, mirror: Mirror, aborts: list[int]) -> list[MissionCommand]:

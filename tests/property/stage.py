@@ -284,9 +284,9 @@ class Stage(SilRun):
         mission = self.mission
         if self.aborts or (self._emergencies and self.monitor.verdict.code is EventCode.ABORTED):
             assert mission.state.mode not in (TURNING, DRIVING), "I6"
-        assert list(mission.state.done) == self.acknowledged, "I8"
-        assert len(set(mission.state.done)) == len(mission.state.done), "I8"
-        assert not set(mission.state.done) & set(mission.state.skipped), "I8"
+        assert list(mission.state.points.done) == self.acknowledged, "I8"
+        assert len(set(mission.state.points.done)) == len(mission.state.points.done), "I8"
+        assert not set(mission.state.points.done) & set(mission.state.points.skipped), "I8"
         if mission.state.stops is not self._stops:
             self._stops = mission.state.stops
             for stop in self._stops:

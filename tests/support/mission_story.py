@@ -110,7 +110,7 @@ class Story:
     def finish(self) -> None:
         """The rest of the survey: it is complete."""
         self.until_state(Mode.DONE)
-        assert [p.point for p in self.state.done] == [1, 2, 3]
+        assert [p.point for p in self.state.points.done] == [1, 2, 3]
 
     def until_state(self, state: Mode, verdict: Verdict | None = FREE) -> None:
         self.until(lambda: self.state.mode is state, verdict)

@@ -127,7 +127,7 @@ class RecordingRun(MeasuredSurvey):
     def status(self, outcome: str = "", exit_status: int = -1) -> None:
         state = self.mission.state
         message = MissionStatus(
-            seq=self.seq, t_s=self.t_s, state=str(state.mode), cause=text_of(state.cause), done=len(state.done),
+            seq=self.seq, t_s=self.t_s, state=str(state.mode), cause=text_of(state.cause), done=len(state.points.done),
             total=self.parts.total_points, elapsed_s=self.t_s, outcome=outcome, exit_status=exit_status,
         )  # fmt: skip
         self.write("mission", message)
@@ -171,7 +171,7 @@ class RecordingRun(MeasuredSurvey):
             self.seen = state
         if len(self.track) >= BATCH:
             self.flush()
-        if self.only is not None and len(self.mission.state.done) >= self.only:
+        if self.only is not None and len(self.mission.state.points.done) >= self.only:
             self.only = None
             self.mission.handle(Abort(Cause("the observatory wants the robot home")))
 

@@ -395,7 +395,7 @@ class RestartedSurvey(SilRun):
     def _take_over(self) -> None:
         cfg, before = self.cfg, self.mission.state
         checkpoint = msgspec.msgpack.decode(self._checkpoint, type=Checkpoint)
-        parts = take_over(cfg, checkpoint, TakenOver(before.done, before.skipped, checkpoint.elapsed_s))
+        parts = take_over(cfg, checkpoint, TakenOver(before.points.done, before.points.skipped, checkpoint.elapsed_s))
         truth, pose = self.robot.world.plant, checkpoint.pose
         self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / checkpoint.sigmas(cfg.limits)[0])
         self.pipeline.localizer = parts.localizer

@@ -32,7 +32,7 @@ from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import MissionCommand, Settling
 from ccatp.survey.budget import BudgetProgress, TimeBudget
 from ccatp.survey.composition import Checkpoint, SurveyParts
-from ccatp.survey.engagement import Held, Levels, Over
+from ccatp.survey.engagement import Earthquake, Held, Over
 from ccatp.survey.events import (
     Abort,
     Fault,
@@ -45,6 +45,7 @@ from ccatp.survey.events import (
     TakenOver,
 )
 from ccatp.survey.planning.route import Route
+from ccatp.survey.points import Failure, PointLog
 from ccatp.survey.state import OnRoute, SurveyPhase, SurveyState
 from ccatp.survey.statechart import Mission
 from tests.faults.linking import Measured
@@ -110,7 +111,7 @@ def test_a_store_is_not_overwritten_and_a_resumed_plan_leaves_out_what_is_measur
         build(where)
     again, store = build(replace(where, is_resuming=True))
     store.close()
-    assert (again.mission.state.done, again.total_points) == ((first,), 9)
+    assert (again.mission.state.points.done, again.total_points) == ((first,), 9)
     assert first not in {stop.point for stop in again.route.stops}
 
 
@@ -120,6 +121,7 @@ QUAKE = structs.replace(
     FREE, code=EventCode.ABORTED, cause=EARTHQUAKE.cause(), forward=False, reverse=False, turn=False, raised=1,
     is_shaking=True,
 )  # fmt: skip
+LACKING, LATE = Failure("no lengths", had_second_try=True), Failure("no time for it", False, True)
 FIX = Fix(1.0, (0.0, 0.0, 0.0), tuple(np.eye(3).ravel().tolist()), 1.0, (1, 2, 3, 4), 0.0)
 
 
@@ -134,10 +136,12 @@ def driving(config: Config) -> Story:
 def taken_over(story: Story, **event: Any) -> SurveyState:
     """What another main loop begins with."""
     survey, state = story.mission.survey, story.mission.state
-    after, _ = survey.handle(state, TakenOver(**{"measured": state.done, "skipped": state.skipped, **event}))
+    after, _ = survey.handle(
+        state, TakenOver(**{"measured": state.points.done, "skipped": state.points.skipped, **event})
+    )
     assert after.is_lost
     assert after.mode in (Mode.IDLE, Mode.HELD)
-    assert (after.course, after.interlock, after.levels) == (OnRoute(), False, Levels())
+    assert (after.course, after.earthquake, after.severity, after.is_latched) == (OnRoute(), Earthquake.NONE, 0, False)
     return after
 
 
@@ -198,22 +202,26 @@ def test_what_failed_and_the_time_that_passed_outlive_a_process(driving: Story) 
     assert third
     budget = BudgetProgress(begun_s=1.0, planned_s=50.0, next_s=5.0)
     state = structs.replace(
-        driving.mission.state, skipped=(first,), failure_causes={first: "no lengths", third: "no time for it"},
-        due=(first, second), retried=frozenset((first, third)), failures=2, backoffs=1, budget=budget, full_fans=True,
-    )  # fmt: skip
+        driving.mission.state,
+        points=PointLog(failed={first: LACKING, third: LATE}, due=(first, second)),
+        failures=2,
+        backoffs=1,
+        budget=budget,
+        full_fans=True,
+    )
     driving.mission = Mission(driving.mission.survey, state)
     after = taken_over(driving, elapsed_s=80.0)
-    kept = ("skipped", "failure_causes", "due", "retried", "failures", "backoffs", "full_fans", "request")
+    kept = ("points", "failures", "backoffs", "full_fans", "request")
     for name in kept:
         assert getattr(after, name) == getattr(driving.mission.state, name), name
     assert after.budget == BudgetProgress(None, 50.0, 5.0, before_s=80.0)
     # Measured, or failed, after the checkpoint was written.
     after = taken_over(driving, measured=(first,), skipped=(second,))
-    assert (after.done, after.skipped, after.due) == ((first,), (second,), ())
-    assert after.failure_causes == {third: "no time for it", second: "not measured"}
+    assert (after.points.done, after.points.skipped, after.points.due) == ((first,), (second,), ())
+    assert after.points.failed == {third: LATE, second: Failure("not measured")}
     # An operator begins again: all that is not measured is tried.
     after = taken_over(driving, skipped=(), is_new_run=True)
-    assert (after.skipped, after.failure_causes, after.due, after.retried) == ((), {}, (), frozenset())
+    assert after.points == PointLog()
     assert (after.budget, after.failures) == (BudgetProgress(), 0)
 
 
@@ -249,7 +257,7 @@ class Doomed(Story):
             self.kept = msgspec.msgpack.decode(msgspec.msgpack.encode(mission.state), type=SurveyState)
         self.frames += 1
         if self.frames in self.kills:
-            done, skipped = mission.state.done, mission.state.skipped
+            done, skipped = mission.state.points.done, mission.state.points.skipped
             self.mission = Mission(self.survey, self.survey.handle(self.kept, TakenOver(done, skipped, self.t))[0])
         return order
 
@@ -263,8 +271,7 @@ def test_a_point_is_retried_once_however_often_main_is_killed(config: Config, se
     killed = Doomed(cfg, set(random.Random(seed).sample(range(1, 2 * alone.frames), 6)))
     killed.until(lambda: killed.mission.state.mode is Mode.DONE, frames=20_000)
     here, there = killed.mission.state, alone.mission.state
-    assert (here.done, here.skipped, here.outcome) == (there.done, there.skipped, there.outcome)
-    assert here.failure_causes == there.failure_causes
+    assert (here.points, here.outcome) == (there.points, there.outcome)
     assert killed.tries == alone.tries
 
 
@@ -277,9 +284,7 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     one, two, three, *_ = (stop.point for stop in built.route.stops if stop.point is not None)
     store.record_fix(one, FIX, DeckPose(0.0, 0.0, 0.0)).result(5.0)
     store.record_skipped(two, 2.0).result(5.0)
-    state = structs.replace(
-        built.mission.state, skipped=(two,), failure_causes={two: "no lengths", three: "no time for it"}
-    )
+    state = structs.replace(built.mission.state, points=PointLog(failed={two: LACKING, three: LATE}))
     built = replace(built, mission=Mission(built.mission.survey, state))
     assert built.mission.handle(Fault(Cause("a wheel is blocked"))) is None
     writer = CheckpointWriter(tmp_path, built.localizer, built.mission, is_patient=True)
@@ -293,8 +298,8 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     store.close()
     state = restarted.mission.state
     assert (state.mode, text_of(state.cause), state.is_faulted) == (Mode.HELD, "a wheel is blocked", True)
-    assert (state.done, state.skipped, state.budget.before_s) == ((one,), (two,), 12.5)
-    assert state.failure_causes == {two: "no lengths", three: "no time for it"}
+    assert (state.points.done, state.points.skipped, state.budget.before_s) == ((one,), (two,), 12.5)
+    assert state.points.failed == {two: LACKING, three: LATE}
     assert len({stop.point for stop in state.route.stops} - {None}) == 6
     assert restarted.start is not None
     assert restarted.start[0] == built.localizer.deck_pose
@@ -305,7 +310,7 @@ def test_a_survey_continues_from_its_directory(tmp_path: Path) -> None:
     store.close()
     state = resumed.mission.state
     assert (state.mode, text_of(state.cause), state.is_faulted) == (Mode.HELD, "a wheel is blocked", False)
-    assert (state.done, state.skipped, state.failure_causes, state.budget.before_s) == ((one,), (), {}, 0.0)
+    assert (state.points, state.budget.before_s) == (PointLog((one,)), 0.0)
     assert len({stop.point for stop in state.route.stops} - {None}) == 8
 
 
@@ -383,15 +388,15 @@ def test_the_checkpoint_is_due_ten_times_a_second_and_at_each_hold_or_abort(driv
     assert (found.t_s, found.elapsed_s, found.boot) == (0.5, 1.0, -1)
     assert (found.pose, found.sigma_m, found.heading_sigma_rad) == (DeckPose(1.0, 2.0, 0.5), 1e-4, 1e-3)
     assert (found.speed_m_s, found.rate_rad_s) == (0.1, 0.2)
-    assert found.state == structs.replace(mission.state, route=Route((), (0.0,)), done=())
+    assert found.state == structs.replace(mission.state, route=Route((), (0.0,)), points=PointLog())
 
 
 @pytest.mark.parametrize("change", ["none", "number of the format", "mode", "cause", "abort_cause", "finding"])
 def test_a_checkpoint_of_an_older_format_is_refused(driving: Story, tmp_path: Path, change: str) -> None:
-    """In formats 1 and 2 causes were texts, in format 3 the mode had flags beside it."""
+    """Formats 1 and 2: causes as texts. Format 3: flags beside the mode. Format 4: four lists of points."""
     found = Checkpoint(1, 1, 0.01, 0.01, DeckPose(0.0, 0.0, 0.0), 1e-4, 1e-3, 0.0, 0.0, driving.mission.state)
     record = msgspec.msgpack.decode(msgspec.msgpack.encode(found))
-    assert record[0] == 4
+    assert record[0] == 5
     if change == "number of the format":
         record[0] = 3
     elif change == "mode":

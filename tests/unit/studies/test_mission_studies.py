@@ -319,7 +319,7 @@ class MeasuredRun(SilRun):
             gc.collect()
             left = tracemalloc.take_snapshot().filter_traces(TRACK)
             self.bytes.append(sum(trace.size for trace in left.traces))
-            self.points.append(len(self.mission.state.done))
+            self.points.append(len(self.mission.state.points.done))
             if len(self.bytes) == 2:
                 raise Enough
 

@@ -18,7 +18,7 @@ from ccatp.kinematics import difference
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.studies.sil_run import SilRun
-from ccatp.survey.behaviours import SETTLE_LIMIT_S, Measuring, Retreat, RetreatStep, Settling, Standstill
+from ccatp.survey.behaviours import SETTLE_LIMIT_S, Measuring, RequestState, Retreat, RetreatStep, Settling, Standstill
 from ccatp.survey.checks import PATIENCE_S, READINGS, MirrorCheck
 from ccatp.survey.events import Pause, Resume
 from ccatp.survey.fix_gate import ApproachCounter
@@ -62,7 +62,7 @@ def test_a_measurement_is_requested_once_and_after_the_measuring_time_at_rest(
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
     asked = [k for k in range(settled, settled + 200) if settling.is_due(at(mirror, k))]
     assert asked == [settled + round(MEASURING_S / DT)]
-    assert (settling.requests, settling.now.is_requested) == (1, True)
+    assert (settling.requests, settling.now.request) == (1, RequestState.MADE)
 
 
 @pytest.mark.fault("E9")
@@ -78,9 +78,9 @@ def test_a_measurement_during_which_the_robot_moves_is_not_wanted(settling: Stan
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
     asked = next(k for k in range(settled, settled + 200) if settling.is_due(at(mirror, k)))
     assert not settling.is_due(at(mirror, asked + 1))
-    assert settling.now.is_requested
+    before = settling.now.request
     settling.is_due(at(mirror, asked + 2, speed_m_s=0.01))
-    assert not settling.now.is_requested
+    assert (before, settling.now.request) == (RequestState.MADE, RequestState.DUE)
     again = next(k for k in range(asked + 3, asked + 400) if settling.is_due(at(mirror, k)))
     assert again > asked + 2 + round(MEASURING_S / DT)
     assert settling.requests == 2

@@ -41,6 +41,7 @@ from ccatp.core import Cause, EventCode, Severity, Verdict
 from ccatp.survey import engagement
 from ccatp.survey.engagement import (
     TRANSITIONS,
+    Earthquake,
     Engagement,
     EngagementRules,
     Event,
@@ -260,7 +261,6 @@ def check(before: State, step: Step, s: State) -> None:
     assert s.kind is not Kind.HOME or s.abort_cause
     assert before.kind is not Kind.OVER or s.phase == before.phase
     assert not before.abort_cause or s.abort_cause, "an order to go home is not forgotten"
-    assert not s.interlock or s.levels.is_shaking
     if step.frame is not None:
         check_verdict(before, step, s)
     else:
@@ -291,7 +291,7 @@ def check_verdict(before: State, step: Step, s: State) -> None:
     if v.severity is Severity.FAULT:
         assert s.kind is Kind.FAULTED
     elif v.is_shaking and not is_at_edge:
-        assert s.is_held or before.interlock
+        assert s.is_held or before.earthquake is Earthquake.HELD
         assert s.abort_cause
     is_plain_edge = is_at_edge and v.severity is Severity.NONE and not is_denied(v)
     if is_plain_edge and not (before.is_held or before.stands_for_fix):
@@ -320,7 +320,7 @@ def check_event(before: State, step: Step, s: State) -> None:
             assert s == before if is_refused else not s.is_held
         case Abort():
             assert s.abort_cause
-            assert not s.is_held or s.interlock
+            assert not s.is_held or s.earthquake is Earthquake.HELD
             assert before.kind not in (Kind.READY, Kind.WORK) or s.is_lost or before.abort_cause or s.kind is Kind.HOME
         case _:
             assert before.kind not in HANDS or s.kind is before.kind, "the work released a hold"
@@ -355,10 +355,9 @@ def check_end(s: State) -> None:
 
 def key(s: State) -> tuple[object, ...]:
     """What the rules can tell apart."""
-    severity, is_latched, is_shaking = s.levels
-    blocks = severity >= Severity.HOLD and severity is not Severity.RETURN
+    blocks = s.severity >= Severity.HOLD and s.severity is not Severity.RETURN
     return (
-        *(s.phase, bool(s.abort_cause), s.interlock, blocks, is_latched, is_shaking),
+        *(s.phase, bool(s.abort_cause), s.earthquake, blocks, s.is_latched),
         *(s.emergency_epoch is None, s.finding.condition, bool(s.located), s.is_lost),
     )
 
@@ -436,4 +435,4 @@ def test_the_summary_state_follows_from_the_phase() -> None:
     }
     assert {state: s.summary_state for state, s in shown.items()} == {state: state for state in shown}
     assert State(Held()).summary_state is SummaryState.ENABLED  # it goes on by itself
-    assert State(Held(), interlock=True).summary_state is SummaryState.DISABLED
+    assert State(Held(), earthquake=Earthquake.HELD).summary_state is SummaryState.DISABLED

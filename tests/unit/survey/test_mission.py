@@ -48,7 +48,7 @@ def test_a_fix_at_the_start_comes_before_the_first_leg_and_costs_no_route(config
     first = config.mission.model_copy(update={"fix_at_start": True})
     story = Story(config.model_copy(update={"mission": first}), mirror)
     story.until(lambda: story.orders != [] and story.orders[-1].measure)
-    assert (story.v, story.omega, story.state.done) == (0.0, 0.0, ())
+    assert (story.v, story.omega, story.state.points.done) == (0.0, 0.0, ())
     story.finish()
     assert story.plans == []
 
@@ -108,7 +108,7 @@ def test_edge_backs_off_at_most_60_mm_turns_away_fixes_and_resumes(story: Story,
     assert hypot(story.x - start[0], story.y - start[1]) <= config.mission.backoff_m + 0.01
     assert story.state.mode is Mode.SETTLING
     story.until(lambda: story.orders[-1].measure)
-    assert story.state.done == ()  # that fix was none of a point
+    assert story.state.points.done == ()  # that fix was none of a point
     story.until(lambda: story.state.mode is Mode.DRIVING)
     assert len(story.plans) == 1  # the route goes on from where the robot really is
     story.finish()
@@ -192,15 +192,15 @@ def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None
         FRONT_OFF, cause=EDGE_SENSOR_STAYS_OFF.cause(), signal="front_left", severity=Severity.HOLD, reverse=False
     )
     story.until_state(Mode.DRIVING)
-    measured = len(story.state.done)
+    measured = len(story.state.points.done)
     for _ in range(300):
         story.frame(stays_off)
     assert story.state.mode is Mode.HELD
     assert story.state.cause == EDGE_SENSOR_STAYS_OFF.cause()
     assert sum(order.measure for order in story.orders[-300:]) == 1
     assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders[-300:])
-    assert len(story.state.done) == measured  # the fix is nobody's point
-    story.until(lambda: len(story.state.done) == 3)  # it came on: the survey goes on by itself
+    assert len(story.state.points.done) == measured  # the fix is nobody's point
+    story.until(lambda: len(story.state.points.done) == 3)  # it came on: the survey goes on by itself
 
 
 @pytest.mark.parametrize("severity", [Severity.NONE, Severity.SLOW, Severity.HOLD])
@@ -324,14 +324,14 @@ def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story
     story.mission.handle(Interrupted(Cause("a late frame")))
     story.until(lambda: bool(story.plans))
     story.mission.handle(FixStored(point))
-    assert story.state.done == (point,)
+    assert story.state.points.done == (point,)
     asked = []
     while story.state.mode is not Mode.DONE:
         if story.frame().measure:
             asked.append(story.state.measuring_point)
             story.mission.handle(FixStored(story.state.measuring_point))
     assert point not in asked
-    assert [p.point for p in story.state.done] == [1, 2, 3]
+    assert [p.point for p in story.state.points.done] == [1, 2, 3]
 
 
 def test_a_leg_that_does_not_end_faults(story: Story) -> None:
@@ -363,7 +363,7 @@ def miss(story: Story, ahead_m: float, left_m: float) -> None:
     story.x -= c * ahead_m - s * left_m
     story.y -= s * ahead_m + c * left_m
     story.mission.handle(PointMissed())
-    assert story.state.done == ()
+    assert story.state.points.done == ()
 
 
 def speeds_until_rest(story: Story) -> list[float]:
@@ -428,7 +428,7 @@ def test_after_a_correction_an_unsafe_turn_is_planned_anew(story: Story, monkeyp
     story.auto_fix = True
     story.until_state(Mode.DONE)
     assert len(story.plans) == 1  # of the leg after the correction; the one after that is as planned
-    assert len(story.state.done) == 3
+    assert len(story.state.points.done) == 3
 
 
 def test_the_robot_is_steered_by_where_it_will_be_and_judged_by_where_it_is(story: Story) -> None:
@@ -529,7 +529,7 @@ def test_after_a_gap_that_leaves_the_arrival_uncertain_a_fix_comes_before_the_ne
     story.open(sigma_m, heading_sigma_rad)
     begun = len(story.orders)
     story.until(lambda: story.orders[-1].measure)
-    assert story.state.done == ()  # that fix was none of a point
+    assert story.state.points.done == ()  # that fix was none of a point
     assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[begun:])
     story.finish()
 
@@ -558,7 +558,7 @@ def test_on_the_way_home_a_gap_has_to_leave_the_clearance_from_the_rim(
 
 def test_eta_falls_as_stops_are_done(story: Story) -> None:
     assert story.state.eta_s == 3.0
-    story.until(lambda: len(story.state.done) == 2)
+    story.until(lambda: len(story.state.points.done) == 2)
     assert story.state.eta_s == 1.0
     story.mission.handle(Abort(Cause("operator")))
     assert story.state.eta_s == 0.0

@@ -15,12 +15,12 @@ from ccatp.errors import ExitStatus
 from ccatp.links.topics import MissionStatus, Turn
 from ccatp.survey.engagement import (
     MOVING,
+    Earthquake,
     EngagedMission,
     Engagement,
     Faulted,
     Held,
     Kind,
-    Levels,
     Over,
     Paused,
 )
@@ -60,7 +60,7 @@ def test_in_every_state_one_acts_and_only_what_would_be_accepted_is_offered() ->
             assert turn.next not in (Next.RESUME, Next.CLEAR) or turn.next in offers
             if s.kind in MOVING:
                 assert turn.actor is Actor.ROBOT
-            if s.is_held_by_hand or s.interlock & s.is_held:
+            if s.is_paused:
                 assert turn.actor in (Actor.OPERATOR, Actor.OBSERVATORY)
             text = turn_text(status_of(s, turn))
             assert text.does
@@ -91,9 +91,9 @@ def test_in_every_state_one_acts_and_only_what_would_be_accepted_is_offered() ->
         (Engagement(Held(), cause=LIFTED.cause()), None, (),
          "held: all edge sensors off: lifted or fallen. Next: an operator: put the robot back on the mirror; do not "
          "cut the power of its fans; then the robot continues by itself"),
-        (Engagement(Held(), cause=EARTHQUAKE.cause(), interlock=True), None, (CLEAR,),
+        (Engagement(Held(), cause=EARTHQUAKE.cause(), earthquake=Earthquake.HELD), None, (CLEAR,),
          "held: emergency: earthquake. Next: the observatory: clear the emergency when the earthquake is over"),
-        (Engagement(Paused(), cause=CALLED, levels=Levels(is_latched=True)), None, (CLEAR,),
+        (Engagement(Paused(), cause=CALLED, is_latched=True), None, (CLEAR,),
          "paused by eva. Next: the observatory: clear the emergency; then resume"),
         (Engagement(Over(SurveyOutcome.COMPLETE)), None, (), "complete. Next: nothing is left to do"),
         (Engagement(Over(SurveyOutcome.AT_BASE), cause=CALLED), None, (),
