@@ -1,7 +1,7 @@
 """The edge rule's own part: which samples count, what an episode is opened with, lifted and put back."""
 
 from dataclasses import dataclass, field
-from math import cos, hypot, pi, sin
+from math import cos, hypot, pi, radians, sin
 from typing import Any, cast
 
 import pytest
@@ -383,18 +383,19 @@ def test_a_reset_drops_the_largest_sigma(rule: Rule) -> None:
 
 
 class Wall:
-    """A rim at x = 0 that counts how often it was asked."""
+    """A straight rim through the origin, ``normal_rad`` inwards, that counts how often it was asked."""
 
-    asked = 0
+    def __init__(self, normal_rad: float = 0.0) -> None:
+        self.asked, self._normal_rad = 0, normal_rad
 
-    def signed_distance_m(self, x: float, _y: float) -> float:
+    def signed_distance_m(self, x: float, y: float) -> float:
         self.asked += 1
-        return x
+        return x * cos(self._normal_rad) + y * sin(self._normal_rad)
 
 
-def centre_at(x_m: float) -> EstimateMessage:
-    """Towards the wall."""
-    return EstimateMessage(seq=0, t_s=0.0, x_m=x_m, y_m=0.0, heading_rad=pi, sigma_m=0.0, state="driving")
+def centre_at(x_m: float, y_m: float = 0.0, heading_rad: float = pi) -> EstimateMessage:
+    """Without another heading it is towards the wall at x = 0."""
+    return EstimateMessage(seq=0, t_s=0.0, x_m=x_m, y_m=y_m, heading_rad=heading_rad, sigma_m=0.0, state="driving")
 
 
 def test_the_clearance_is_looked_up_when_it_may_be_short_and_ten_times_a_second(cfg: Config) -> None:
@@ -418,3 +419,17 @@ def test_the_centre_at_the_rim_bars_the_way_that_it_takes_outwards(
     check = CentreClearanceCheck(cast(Rim, Wall()), cfg.robot, cfg.danger)
     check.step(0.0, centre_at(0.001), [WheelSample(0.0, 0.5 * sum_rad_s, 0.5 * sum_rad_s)])
     assert check.direction == direction
+
+
+@pytest.mark.parametrize("wheel_rad_s", [1.0, -1.0])
+@pytest.mark.parametrize("heading_deg", range(0, 360, 30))
+@pytest.mark.parametrize("normal_deg", [10, 100, 190, 280])
+def test_only_the_way_outwards_is_barred_whatever_the_heading_and_the_rim(
+    cfg: Config, normal_deg: int, heading_deg: int, wheel_rad_s: float
+) -> None:
+    normal_rad, heading_rad = radians(normal_deg), radians(heading_deg)
+    check = CentreClearanceCheck(cast(Rim, Wall(normal_rad)), cfg.robot, cfg.danger)
+    here = centre_at(0.001 * cos(normal_rad), 0.001 * sin(normal_rad), heading_rad)
+    check.step(0.0, here, [WheelSample(0.0, wheel_rad_s, wheel_rad_s)])
+    is_outwards = wheel_rad_s * cos(heading_rad - normal_rad) < 0.0
+    assert check.direction == (wheel_rad_s if is_outwards else 0.0)
