@@ -42,9 +42,10 @@ def simulate(
 ) -> SurveyRun:
     """Simulate a survey, in about a twentieth of its time; what is not given is as in the shipped configuration.
 
-    Decisions and estimates are those of ``ccatp run --sim`` with the same configuration, but for fixes that contradict
-    the estimate: here they are not measured again. ``settings``: dotted keys of the configuration; ``faults``: file of
-    a fault plan. ``keep_samples`` costs about 100 MB for a thousand seconds.
+    Decisions and estimates are those of ``ccatp run --sim`` with the same configuration, as long as the daemon's checks
+    of a fix (``survey.fix_gate``, ``survey.laser_follow``) find nothing: here they are not made, so that a fault of the
+    laser may give another result. ``settings``: dotted keys of the configuration; ``faults``: file of a fault plan.
+    ``keep_samples`` costs about 100 MB for a thousand seconds.
     Raises ConfigError: a value cannot be used; PlanError: a point cannot be reached; NoFrames: a plan ends all frames.
     """
     named = {
