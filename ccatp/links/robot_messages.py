@@ -41,13 +41,16 @@ class VehicleData(msgspec.Struct):
 
 
 class RobotData(msgspec.Struct, omit_defaults=True):
-    """Data of the robot: lengths in m, robot frame; edge sensors in the order of ``EdgeSample``."""
+    """Data of the robot: lengths in m, robot frame; edge sensors in the order of ``EdgeSample``.
 
-    wheel_radius_m: Positive
-    wheel_base_m: Positive
+    The limits of a robot are those of ``ccatp.config.robot_limits``: a client refuses a robot beyond them by name.
+    """
+
+    wheel_radius_m: float
+    wheel_base_m: float
     edge_sensors_m: tuple[tuple[Length, Length], tuple[Length, Length], tuple[Length, Length], tuple[Length, Length]]
     puck_m: tuple[Length, Length, Length]
-    max_wheel_rad_s: Positive
+    max_wheel_rad_s: float
     fan_floor: Fraction
     vehicle: VehicleData | None = None
 
@@ -57,11 +60,11 @@ class Hello(RobotLinkMessage, tag="hello"):
 
     protocol: Name
     boot: Sequence53
-    nonce: Annotated[str, Meta(pattern="^[0-9a-f]{32}$")]
+    nonce: Annotated[str, Meta(pattern="^[0-9a-fA-F]{32}$")]
     auth: Literal["none", "hmac-sha256"]
     lockstep: bool
-    frame_hz: Positive
-    ttl_s: Positive
+    frame_hz: float
+    ttl_s: float
     robot: RobotData
 
 

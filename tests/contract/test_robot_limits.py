@@ -99,6 +99,15 @@ async def test_a_client_joins_a_robot_within_the_limits_and_no_other(among_beaco
 
 
 @pytest.mark.fault("L18")
+@pytest.mark.parametrize("value", [0.0, -1.0])
+@pytest.mark.parametrize("name", ["ttl_s", "frame_hz", "wheel_radius_m", "wheel_base_m", "max_wheel_rad_s"])
+async def test_a_value_that_is_not_positive_is_refused_by_its_name_as_well(name: str, value: float) -> None:
+    is_own = name in {"ttl_s", "frame_hz"}
+    hello = replace(HELLO, **{name: value}) if is_own else replace(HELLO, robot=replace(HELLO.robot, **{name: value}))
+    assert not await is_joined(hello)
+
+
+@pytest.mark.fault("L18")
 @pytest.mark.parametrize(("name", "side", "is_beyond"), CASES)
 def test_the_conformance_suite_has_the_same_limits(name: str, side: str, is_beyond: bool) -> None:
     hello: dict[str, Any] = {"lockstep": False, "frame_hz": 100.0, "ttl_s": 0.25}

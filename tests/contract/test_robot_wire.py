@@ -251,6 +251,13 @@ def test_the_first_and_the_last_time_are_in_range(t_s: float) -> None:
     assert decoded.imu[0].t_s == decoded.enc[0].t_s == decoded.edge[0].t_s == t_s
 
 
+@pytest.mark.parametrize("nonce", [NONCE, NONCE.upper()])
+def test_the_digits_of_a_nonce_may_be_capitals(nonce: str) -> None:
+    hello = decode_from_robot(HELLO_LINE.replace(NONCE.encode(), nonce.encode()))
+    assert isinstance(hello, Hello)
+    assert hello.nonce == nonce
+
+
 def test_unknown_keys_are_ignored_and_unknown_types_are_recognized() -> None:
     assert decode_from_client(b'{"type":"drive","note":{"a":[1,":"]},"seq":7,"ack":6,"wr":3.5,"wl":-0.25}') == Drive(
         seq=7, ack=6, wr=3.5, wl=-0.25
