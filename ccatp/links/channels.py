@@ -14,7 +14,6 @@ import msgspec
 from ccatp.core import EmergencyKind
 
 MAX_REQUEST_BYTES = 4096
-MAX_NOTE_CHARACTERS = 2000
 MAX_NAME_CHARACTERS = 100
 
 
@@ -27,7 +26,7 @@ class EmergencyRequest(msgspec.Struct, frozen=True, tag_field="cmd", tag="emerge
 
     kind: EmergencyKind
     id: str
-    note: Annotated[str, msgspec.Meta(max_length=MAX_NOTE_CHARACTERS)] = ""
+    note: str = ""
 
     def __post_init__(self) -> None:
         uuid_of(self.id)

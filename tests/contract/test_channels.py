@@ -118,6 +118,14 @@ def test_unknown_keys_are_ignored_and_the_note_may_be_absent() -> None:
     assert parsed == EmergencyRequest(kind=EmergencyKind.FIRE, id=ID, note="")
 
 
+def test_an_emergency_is_taken_whatever_the_length_of_its_note_in_a_request_of_the_largest_size() -> None:
+    desk = Desk()
+    rest = f'{{"cmd":"emergency","kind":"fire","id":"{ID}","note":""}}'
+    text = rest.replace('""', f'"{"x" * (MAX_REQUEST_BYTES - len(rest))}"')
+    assert len(text) == MAX_REQUEST_BYTES
+    assert ask(desk, text) == {"ok": True, "id": ID, "latched": True, "code": 2}
+
+
 BAD = {
     "empty": (b"", "not UTF-8 JSON"),
     "not json": (b"fire!", "not UTF-8 JSON"),
