@@ -20,6 +20,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.report.html import render
 from ccatp.rest import WHEEL_STANDS_RAD_S
+from ccatp.sensing.sample_times import possible_gravity
 from ccatp.survey.checks import MirrorCheck
 from ccatp.survey.composition import plan_survey, robot_problems
 from ccatp.survey.forecast import clock, forecast_time
@@ -261,7 +262,8 @@ def _edge_sensors(report: RobotReport) -> PreflightResult:
 
 def _gravity(report: RobotReport) -> PreflightResult:
     check = MirrorCheck(report.mirror, is_heading_known=True)
-    is_known = any(check.update(frame.t, frame.gravity, report.mirror.base_pose) for frame in report.frames)
+    readings = ((frame.t, possible_gravity(frame.t, frame.gravity)) for frame in report.frames)
+    is_known = any(check.update(t_s, gravity, report.mirror.base_pose) for t_s, gravity in readings)
     if check.contradiction:
         todo = "set the robot down at base with its heading; check run.mirror, and the axes of docs/protocols.md"
         return failed(check.contradiction, todo)

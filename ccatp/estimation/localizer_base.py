@@ -18,6 +18,7 @@ from ccatp.filters import FILTERS
 from ccatp.filters.base import Filter, FilterDiverged
 from ccatp.mirror.mirror import Mirror
 from ccatp.sensing.imu_gate import ImuGate
+from ccatp.sensing.sample_times import LATEST_S, possible_gravity, possible_samples
 from ccatp.sensing.wheel_means import WheelMeans, largest_rate_rad_s
 
 ImuReadings = Sequence[ImuSample]
@@ -33,7 +34,6 @@ LONGEST_GAP_S = 0.4
 """After this time without a drive the robot stands: time-to-live of the last drive, and run-down of the wheels."""
 BACKWARD_LIMIT = 5
 """Number of backward time stamps in a row that requests a hold."""
-_ROUNDING_S = 1e-3  # interface control document 1: a sample may be later than its frame by the rounding of both times
 _LONGEST_INTERVAL_S = 0.05  # of two edge samples around a transition; later the place of the sensor in between is open
 _READABLE = 1e9  # rad/s or m/s^2: far beyond every sensor's range; its squares and products stay finite
 
@@ -89,7 +89,7 @@ class SampleValidator:
         if (
             newest_right_s < first_s > newest_left_s
             and oldest_s <= first_s
-            and times[-1] <= frame_s + _ROUNDING_S
+            and times[-1] <= frame_s + LATEST_S
             and all(map(lt, times, times[1:]))
             and None not in right
             and None not in left
@@ -123,7 +123,7 @@ class SampleValidator:
         """The usable IMU samples."""
         if len(samples) == 1:
             (sample_s, ax, wz), source, oldest_s = samples[0], self._imu, frame_s - self._history_s
-            is_in_time = source.newest_s < sample_s >= oldest_s and sample_s <= frame_s + _ROUNDING_S
+            is_in_time = source.newest_s < sample_s >= oldest_s and sample_s <= frame_s + LATEST_S
             if is_in_time and hypot(ax, wz) < _READABLE:
                 use_samples((sample_s,), oldest_s, source)
                 return samples
@@ -138,7 +138,7 @@ class SampleValidator:
 
     def _is_usable(self, source: SampleSource, sample_s: float, frame_s: float) -> bool:
         oldest_s = frame_s - self._history_s
-        if sample_s > frame_s + _ROUNDING_S:
+        if sample_s > frame_s + LATEST_S:
             reason = "ahead"
         elif sample_s < oldest_s:
             reason = "late"
@@ -216,9 +216,10 @@ class LocalizerBase(ABC):
     ``wrap`` wraps the filter of ``run.filter``. ``t_s``: robot time of the pose, that of the last frame used; -inf
     before the first. ``hold_cause``: why the mission should hold, until ``clear_hold``. ``is_frozen``: the filter has
     diverged, and the pose is constant until the next fix. ``notices``: for the operator, cleared by their reader.
-    Refused are samples older than ``localizer.history_s``, inertial samples that contradict the wheels, and impossible
-    wheel rates. ``gap_s``: time without encoder samples since the last fix that was used, s; then the odometry is
-    predicted from the drives. ``coasted``: the motion that was predicted for the newest frame, ``None`` without a gap.
+    Refused are samples of impossible times, inertial and encoder samples older than ``localizer.history_s``, inertial
+    samples that contradict the wheels, and impossible wheel rates. ``gap_s``: time without encoder samples since the
+    last fix that was used, s; then the odometry is predicted from the drives. ``coasted``: the motion that was
+    predicted for the newest frame, ``None`` without a gap.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, states: int, wrap: FilterWrap) -> None:
@@ -284,6 +285,12 @@ class LocalizerBase(ABC):
             self._resync(t_s, last_s)
         means.take(encoders, dt_s)
         timely, (right, left) = intake.imu(t_s, imu), intake.wheels(t_s, encoders)
+        edges_in_time = possible_samples(t_s, edges)
+        if edges_in_time is not edges:
+            self.counts["edge_misdated"] += len(edges) - len(edges_in_time)
+        if gravity is not None and possible_gravity(t_s, gravity) is None:
+            self.counts["gravity_misdated"] += 1
+            gravity = None
         if imu and not self._imu_gate.admit(imu, means.yaw_rad_s, t_s - imu[-1][0] - dt_s):
             self.counts["imu_doubted"] += len(imu)
             timely = ()
@@ -292,7 +299,7 @@ class LocalizerBase(ABC):
             intake.backward_source = ""
         self.coasted = None
         try:
-            self._use(dt_s, timely, right, left, edges, gravity, set_points)
+            self._use(dt_s, timely, right, left, edges_in_time, gravity, set_points)
         except FilterDiverged as error:
             self._freeze(error)
 

@@ -7,7 +7,7 @@ place in time is not known. What is not used is missing, so the rules for silent
 from collections.abc import Sequence
 from typing import TypeVar
 
-from ccatp.core import EdgeSample, ImuSample, WheelSample
+from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
 
 LATEST_S = 1e-3
 """A sample may be later than its frame by this, because the robot rounds its times."""
@@ -24,6 +24,11 @@ def possible_samples(frame_s: float, samples: Sequence[_Sample]) -> Sequence[_Sa
         if not oldest_s <= sample[0] <= latest_s:
             return [sample for sample in samples if oldest_s <= sample[0] <= latest_s]
     return samples
+
+
+def possible_gravity(frame_s: float, sample: GravitySample | None) -> GravitySample | None:
+    """The reading of gravity in a frame at ``frame_s``, if there is one and its time is possible."""
+    return sample if sample is not None and -OLDEST_S <= sample[0] - frame_s <= LATEST_S else None
 
 
 def worst_offset_s(frame_s: float, samples: Sequence[ImuSample | WheelSample | EdgeSample]) -> float:

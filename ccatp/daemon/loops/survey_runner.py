@@ -29,6 +29,7 @@ from ccatp.links.topics import (
     TreatmentKind,
 )
 from ccatp.records.store import MissionStore
+from ccatp.sensing.sample_times import possible_gravity
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
@@ -230,7 +231,8 @@ class SurveyRunner(MissionRunner):
         In lockstep the mission begins at once, and ends if gravity contradicts: a simulation cannot do harm, and a run
         does not depend on this check.
         """
-        if check.update(sensors.t, sensors.gravity, self._localizer.deck_pose):
+        gravity = possible_gravity(sensors.t, sensors.gravity)
+        if check.update(sensors.t, gravity, self._localizer.deck_pose):
             self._mirror_check = None
             if check.warning:
                 self.telemetry.notify_operator("warning", check.warning)

@@ -322,8 +322,9 @@ def test_seams_is_a_switch() -> None:
 
 def test_gravity_is_a_switch() -> None:
     robot = Robot()
-    gravity = GravitySample(0.0, *mirror().gravity_in_robot(robot.pose))
-    with_, without = both("gravity", [f._replace(gravity=gravity) for f in robot.frames(5.3)])
+    gravity = mirror().gravity_in_robot(robot.pose)
+    frames = [frame._replace(gravity=GravitySample(frame.t_s, *gravity)) for frame in robot.frames(5.3)]
+    with_, without = both("gravity", frames)
     assert with_.heading_sigma_rad < 0.85 * without.heading_sigma_rad
     assert without.heading_sigma_rad == pytest.approx(0.01, rel=1e-2)
 

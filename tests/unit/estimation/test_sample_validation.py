@@ -222,6 +222,17 @@ def test_gravity_across_the_cut_of_the_angle(mirror: Mirror, full: FullStateConf
     assert left == pytest.approx(2.0 * beyond * variance / (variance + 0.1**2), rel=1e-3)  # the frames before the rest
 
 
+@pytest.mark.parametrize("by_s", [-5.0, -1.001, 0.0011, 5.0])
+def test_gravity_with_an_impossible_time_stamp_is_not_used(mirror: Mirror, by_s: float) -> None:
+    robot, found = Robot(), build(start_heading_sigma_rad=0.3)
+    before = float(found.state[0][PSI])
+    turned = DeckPose(robot.x_m, robot.y_m, robot.pose.heading_rad + 0.2)
+    frames = with_gravity(robot.frames(6.3), mirror, turned)
+    run(found, [f._replace(gravity=f.gravity and f.gravity._replace(t_s=f.t_s + by_s)) for f in frames])
+    assert found.state[0][PSI] == pytest.approx(before, abs=1e-12)
+    assert found.counts["gravity_misdated"] == len(frames)
+
+
 def test_gravity_that_contradicts_is_gated(mirror: Mirror) -> None:
     robot, found = Robot(), build()
     before = float(found.state[0][PSI])

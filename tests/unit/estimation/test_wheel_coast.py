@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from ccatp.control.wheel_motion import SentDrives, SetPoints
-from ccatp.core import EdgeSample, WheelSample
+from ccatp.core import EdgeSample, PanelPose, WheelSample
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import EdgeScanner
 from ccatp.estimation.odometry import WheelAngle
 from ccatp.estimation.wheel_coast import CoastedMotion, WheelCoast
-from tests.unit.estimation.drive import Frame, Robot, build, config, trapeze
+from tests.unit.estimation.drive import STEEP, Frame, Robot, build, config, trapeze
 
 FRAME_S = 0.01
 STILL = SetPoints(0.0, 0.0)
@@ -197,6 +197,23 @@ def test_a_transition_in_a_gap_of_the_edge_sensors_is_none() -> None:
     scanner.scan([EdgeSample(0.0, 1, 1, 1, 1)])
     assert scanner.scan([EdgeSample(0.2, 0, 1, 1, 1)]) == []
     assert len(scanner.scan([EdgeSample(0.21, 1, 1, 1, 1)])) == 1
+
+
+@pytest.mark.parametrize("by_s", [-5.0, -1.001, 0.0011, 100.0])
+def test_an_edge_sample_with_an_impossible_time_stamp_is_not_used_and_hides_no_seam(by_s: float) -> None:
+    start = PanelPose(STEEP.panel, STEEP.x_m, STEEP.y_m, 0.0)
+    frames = Robot(start, v=trapeze(0.1, 6.0, 0.1, 0.2), has_edges=True).frames(6.2)
+    found = {}
+    for is_misdated in (False, True):
+        localizer = build(start=start)
+        for number, frame in enumerate(frames):
+            wrong = [frame.edges[-1]._replace(t_s=max(frame.t_s + by_s, 0.0))] if is_misdated and number == 110 else []
+            localizer.step(*frame._replace(edges=[*frame.edges, *wrong]))
+        found[is_misdated] = localizer
+    assert found[False].counts["crossings_used"] > 0
+    assert found[True].counts["crossings_used"] == found[False].counts["crossings_used"]
+    assert found[True].deck_pose == found[False].deck_pose
+    assert (found[True].counts["edge_misdated"], found[False].counts["edge_misdated"]) == (1, 0)
 
 
 # -- the localizer ----------------------------------------------------------------------------------------------------
