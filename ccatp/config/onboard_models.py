@@ -67,7 +67,7 @@ class Bno055Config(Model):
     bus: Annotated[int, Field(ge=0, le=255)]
     address: Annotated[int, Field(ge=0x08, le=0x77)]
     axes: tuple[Axis, Axis, Axis]
-    rate_hz: Positive
+    rate_hz: Annotated[float, Field(gt=0.0, le=100.0)]
     timeout_s: Positive
     noise_rad_s: Positive
     noise_m_s2: Positive
@@ -78,7 +78,7 @@ class DaqConfig(Model):
 
     device: Text
     baud: Annotated[int, Field(ge=9600, le=4_000_000)]
-    sample_hz: Positive
+    sample_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
     timeout_s: Positive
     full_scale_v: Positive
     battery_ratio: Positive  # battery voltage over the voltage at the converter

@@ -25,6 +25,8 @@ from ccatp.onboard.wheel_servo import WheelServo
 # Without these the robot does not move. Its clients decide what to do about a weak fan or battery.
 NEEDED = ("imu", "encoder_right", "encoder_left", "edge", "stall")
 _SLIDE_HOLD_S = 0.5
+# Wheels and edge sensors have up to 1000 samples a second, and a frame may last 50 ms, or somewhat longer.
+FAST_SAMPLES = 54
 
 WheelRates = tuple[float, float | None, float | None]
 
@@ -200,8 +202,8 @@ class OnboardRobot(ControlledRobot):
             self.seq,
             round(t_s, 6),
             imu=self._take_samples(self._imu, since_s),
-            enc=self._take_samples(self._enc, since_s),
-            edge=self._take_samples(self._edge, since_s),
+            enc=self._take_samples(self._enc, since_s, FAST_SAMPLES),
+            edge=self._take_samples(self._edge, since_s, FAST_SAMPLES),
             gravity=gravity,
             fans=self.fans.duty,
             soc=self._soc,

@@ -233,6 +233,32 @@ def test_a_burst_of_samples_keeps_the_newest_in_a_line_that_fits(monkeypatch: py
     assert bench.robot.dropped_samples > 300
 
 
+def test_a_frame_of_the_lowest_rate_holds_every_sample_of_the_fastest_sensors(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    bench.run(0.1)
+    link = CFG.link.model_copy(update={"frame_hz": 20.0})
+    robot = OnboardRobot(CFG.model_copy(update={"link": link}), bench.hardware)
+    start_s = 1e5 + 1.0 / 3.0  # after a day, times have as many digits as they can
+
+    def read(now_s: float) -> Readings:
+        times = [now_s - 0.05 + 0.001 * (k + 1) for k in range(50)]
+        counts = [(t, round(1e3 * t), -round(1e3 * t)) for t in times]
+        edges = [(t, 2.4, 2.4, 0.5, 2.4) for t in times]
+        imu = [(t, -1.0 / 3.0, -2.0 / 3.0, 0.0) for t in times[::10]]
+        return Readings(imu, counts, edges, None, 1.0, {})
+
+    monkeypatch.setattr(bench.hardware, "read", read)
+    for k in range(3):
+        now_s = start_s + 0.05 * k
+        robot.control(now_s)
+        robot.advance_to(now_s)
+        assert len(robot.delivered_line) - 1 <= MAX_LINE_BYTES
+    frame = decode_from_robot(robot.delivered_line[:-1])
+    assert isinstance(frame, Sensors)
+    assert (len(frame.enc), len(frame.edge), len(frame.imu)) == (50, 50, 5)
+    assert robot.dropped_samples == 0
+
+
 def test_a_robot_that_slides_holds_itself_with_full_fans_and_reports_it(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench("fyst-m1")
     read, slide = bench.hardware.read, 0.0
@@ -317,6 +343,8 @@ def test_a_time_to_live_of_less_than_two_frames_is_refused() -> None:
         ("robot.max_wheel_rad_s", 0.5, "robot.max_wheel_rad_s = 0.5 is 0.015 m/s; the robot link allows 0.02 to 1"),
         ("robot.edge_sensors_m", [[0.09, -0.08], [0.09, 0.08], [-0.09, 0.08], [-0.09, -0.08]], "is not front-left"),
         ("link.ttl_s", 0.015, "link.ttl_s = 0.015 must be greater than or equal to 0.05"),
+        ("devices.daq.sample_hz", 2000.0, "devices.daq.sample_hz = 2000.0 must be less than or equal to 1000"),
+        ("devices.bno055.rate_hz", 200.0, "devices.bno055.rate_hz = 200.0 must be less than or equal to 100"),
         ("link.frame_hz", 10.0, "link.frame_hz = 10.0 must be greater than or equal to 20"),
         ("servo.loop_hz", 120.0, "devices.timer.timeout_s = 0.03 brakes a loop with steps of 0.00833333 s"),
         ("servo.max_v", 24.0, "servo.max_v = 24 is more than devices.motors.supply_v = 12"),
