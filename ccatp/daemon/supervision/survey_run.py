@@ -55,7 +55,7 @@ def check_survey(options: RunOptions, cfg: Config) -> None:
 
 
 def check_resumed(cfg: Config, run_dir: Path) -> None:
-    """Raises ``ConfigError``: the survey in a run directory has other points."""
+    """Raises ``ConfigError``: the survey in a run directory has other points, or another world, filter or physics."""
     before = load_config(run_dir / "config.toml")
     for key, was, wanted in (
         ("run.mirror", before.mirror.name, cfg.mirror.name),
@@ -63,6 +63,8 @@ def check_resumed(cfg: Config, run_dir: Path) -> None:
         ("run.panels", before.run.panels, cfg.run.panels),
         ("run.seed", before.run.seed, cfg.run.seed),
         ("run.world", before.world.name, cfg.world.name),
+        ("run.filter", before.run.filter, cfg.run.filter),
+        ("sim.robot.physics", before.sim.robot.physics, cfg.sim.robot.physics),
     ):
         if was != wanted:
             raise ConfigError(

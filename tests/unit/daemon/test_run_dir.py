@@ -140,6 +140,8 @@ def test_the_directory_of_a_run_that_goes_on_is_not_offered_for_a_resume(tmp_pat
         (True, {**ONE_PANEL, "run.mirror": "thesis-m2"}, "run.mirror was fyst-m1 in .* and is thesis-m2 now"),
         (True, {**ONE_PANEL, "run.seed": 2}, "run.seed was 1 in .* and is 2 now; leave it out"),
         (True, {**ONE_PANEL, "run.world": "hard"}, "run.world was thesis in .* and is hard now"),
+        (True, {**ONE_PANEL, "run.filter": "ukf"}, "run.filter was ekf in .* and is ukf now; leave it out"),
+        (True, {**ONE_PANEL, "sim.robot.physics": "motors"}, "sim.robot.physics was lag in .* and is motors now"),
         (
             True,
             {**ONE_PANEL, "mirror.panels.points_x_mm": [-200.0, 0.0, 200.0]},
