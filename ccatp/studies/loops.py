@@ -292,8 +292,8 @@ def run(cfg: Config, out: Path) -> dict[str, Any]:
     omega = np.geomspace(*OMEGA_RAD_S, GRID_POINTS)
     magnitude, phase = (np.array(part) for part in zip(*(response(loop, omega) for loop in loops), strict=True))
     names = np.array([f"{loop.gains}/{loop.axis}/{loop.plant}/{loop.delay_frames}" for loop in loops])
-    np.savez_compressed(out / "result.npz", omega_rad_s=omega, loop=names, magnitude=magnitude, phase_rad=phase)
-    return write_analysis("loops", cells, COLUMNS, out, started_s)
+    arrays = {"omega_rad_s": omega, "loop": names, "magnitude": magnitude, "phase_rad": phase}
+    return write_analysis("loops", cells, COLUMNS, out, started_s, arrays=arrays)
 
 
 def _cell(loop: Loop, found: Margins) -> dict[str, Any]:

@@ -107,10 +107,16 @@ def write_results(
 
 
 def write_analysis(
-    name: str, cells: Sequence[Mapping[str, Any]], columns: str, out: Path, started_s: float
+    name: str,
+    cells: Sequence[Mapping[str, Any]],
+    columns: str,
+    out: Path,
+    started_s: float,
+    arrays: Mapping[str, NDArray[Any]],
 ) -> dict[str, Any]:
-    """Write ``result.json`` and ``table.md`` of a study without runs; ``started_s``: its start by ``perf_counter``."""
+    """Write the files of a study without runs, except its figures; ``started_s``: its start by ``perf_counter``."""
     result = {"study": name, "cells": list(cells), "wall_s": time.perf_counter() - started_s}
+    np.savez_compressed(out / "result.npz", allow_pickle=False, **arrays)
     _write(out, result, table(cells, columns))
     return result
 

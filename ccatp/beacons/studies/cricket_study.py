@@ -209,10 +209,11 @@ _ROBUST = 4.0
 
 
 def run_sizes(cfg: Config, out: Path) -> dict[str, Any]:
-    """Map random fields of increasing size, once each, and write ``result.json``, ``table.md`` and the figure."""
+    """Map random fields of increasing size, once each, and write the files and the figure."""
     began_s = time.perf_counter()
     cells = [_sized_cell(size, cfg.run.seed) for size in SIZES]
-    result = write_analysis("mote-sizes", cells, " ".join(list(cells[0])[3:]), out, began_s)
+    arrays = {key: np.array([cell[key] for cell in cells], dtype=np.float64) for key in cells[0]}  # None is NaN
+    result = write_analysis("mote-sizes", cells, " ".join(list(cells[0])[3:]), out, began_s, arrays=arrays)
     with plot(out / "mote_sizes", 6.5, 4.2, legend=2) as (axes,):
         for number, (key, label) in enumerate((("map_s", "map"), ("outlook_s", "rank and folds, before"))):
             motes, times_s = [cell["motes"] for cell in cells], [cell[key] for cell in cells]

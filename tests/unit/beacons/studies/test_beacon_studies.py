@@ -105,6 +105,8 @@ def test_sizes(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert [cell["ranges"] > cell["motes"] for cell in found["cells"]] == [True, True]
     assert (tmp_path / "mote_sizes.png").exists()
     assert len((tmp_path / "table.md").read_text().splitlines()) == 4
+    with np.load(tmp_path / "result.npz") as arrays:
+        assert arrays["motes"].tolist() == [cell["motes"] for cell in found["cells"]]
     for cell in found["cells"]:
         assert cell["cost_per_dof"] < 2.0
         assert cell["bound_m"] is None or cell["rms_of_others_m"] < 3.0 * cell["bound_m"]
