@@ -173,19 +173,23 @@ def _commands(group: click.Group, path: tuple[str, ...]) -> Iterator[str]:
         command = group.get_command(context, name)
         assert command is not None
         own = (*path, name)
+        if not isinstance(command, click.Group) or command.invoke_without_command:
+            yield from _command(command, own)
         if isinstance(command, click.Group):
             yield from _commands(command, own)
-            continue
-        usage = " ".join(
-            [*own, *(p.make_metavar(click.Context(command)) for p in command.params if isinstance(p, click.Argument))]
-        )
-        yield f"## `{usage}`\n"
-        paragraphs = inspect.cleandoc(command.help or "").replace("\b", "").strip()
-        yield f"{paragraphs}\n"
-        for option in command.params:
-            if isinstance(option, click.Option) and not option.hidden:
-                yield f"* {_option(option)}"
-        yield ""
+
+
+def _command(command: click.Command, own: tuple[str, ...]) -> Iterator[str]:
+    arguments = (p.make_metavar(click.Context(command)) for p in command.params if isinstance(p, click.Argument))
+    yield f"## `{' '.join([*own, *arguments])}`\n"
+    for paragraph in inspect.cleandoc(command.help or "").split("\n\n"):
+        lines = paragraph.strip().removeprefix("\b\n")
+        # click wraps a paragraph, but not one that begins with \b: a table.
+        yield f"{lines}\n" if lines == paragraph.strip() else f"```text\n{lines}\n```\n"
+    for option in command.params:
+        if isinstance(option, click.Option) and not option.hidden:
+            yield f"* {_option(option)}"
+    yield ""
 
 
 def _option(option: click.Option) -> str:

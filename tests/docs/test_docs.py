@@ -66,6 +66,22 @@ def test_what_is_made_from_the_code_is_current() -> None:
         assert path.read_text(encoding="utf-8") == text, f"{path.name} is not current: make docs"
 
 
+def command_names(group: click.Group, path: str = "ccatp") -> Iterator[str]:
+    """Everything that can be called, groups that do something by themselves as well."""
+    for name in group.list_commands(click.Context(group)):
+        command = group.get_command(click.Context(group), name)
+        assert command is not None
+        if not isinstance(command, click.Group) or command.invoke_without_command:
+            yield f"{path} {name}"
+        if isinstance(command, click.Group):
+            yield from command_names(command, f"{path} {name}")
+
+
+def test_the_page_of_commands_has_each_of_them() -> None:
+    heads = re.findall(r"^## `([a-z0-9 -]+)", (DOCS / "commands.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert [head.strip() for head in heads] == list(command_names(cli))
+
+
 @pytest.mark.parametrize("path", sorted((DOCS / "measurements").glob("*.md")), ids=lambda path: path.stem)
 def test_a_page_of_measurements_begins_with_its_result(path: Path) -> None:
     title, result, *_ = path.read_text(encoding="utf-8").split("\n\n")
