@@ -49,6 +49,9 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
     "--map", "map_file", type=common.PATH, help="Known places of beacons: the vehicle is localized among them."
 )
 @click.option("--start", metavar="X,Y,HEADING", help="First pose, in place of that of the truth: m, m, rad.")
+@click.option(
+    "--tag", default="", metavar="NAME", help="Radio of the vehicle that is used; by default that of most readings."
+)
 @click.option("--topics", "topics_file", type=common.PATH, help="TOML file that names the topics of a ROS bag.")
 @common.figure_option("Draw map, path and residuals")
 @click.option(
@@ -69,8 +72,8 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
     settings: Mapping[str, object], keep_heading: bool, map_file: Path | None, start: str | None,
-    topics_file: Path | None, figure_file: Path | None, tum_file: Path | None, out_dir: Path | None, peers: bool,
-    json_output: bool,
+    tag: str, topics_file: Path | None, figure_file: Path | None, tum_file: Path | None, out_dir: Path | None,
+    peers: bool, json_output: bool,
 ) -> None:  # fmt: skip
     """Map the beacons of a recorded run and find the vehicle's path on that map, or on a known one.
 
@@ -86,7 +89,7 @@ def slam(
 
     assumed = load_recordings_config(config_file, settings)
     known = _known(map_file, start)
-    run = read_run(path, data_format, robot, topics_file, turns_heading=not keep_heading, known=known)
+    run = read_run(path, data_format, robot, topics_file, tag=tag, turns_heading=not keep_heading, known=known)
     if known.map is not None and known.first_pose is None and run.truth is None:
         raise click.UsageError("--map: the run has no truth of its first pose; give it with --start X,Y,HEADING")
     common.warn(run.warnings)

@@ -1,19 +1,21 @@
 """From the recording of any format to a run for the estimators: the one path that every reader goes through."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.events import EVENTS, MOTIONS, READING_KINDS, Recording
-from ccatp.beacons.datasets.ordering import ordered
+from ccatp.beacons.datasets.ordering import in_seconds, ordered
 from ccatp.beacons.datasets.placeholders import frozen, measured, true_positions, without_wild_steps
-from ccatp.beacons.datasets.tables import RadioDataError, Table, listed, long_pauses, needed_of, plural, within
+from ccatp.beacons.datasets.tables import RadioDataError, Table, instant, listed, long_pauses, needed_of, plural, within
 from ccatp.beacons.datasets.trajectory import (
     BEFORE_S,
     at_antenna,
     bridged,
     checked_heading,
+    motions_between,
     pose_of_truth,
     way_at,
 )
@@ -22,6 +24,7 @@ from ccatp.core import FloatArray
 
 NOTHING = Known()
 LEAST_STEPS = 2
+MOST_ONCE = 20  # beacons that were heard once, if they are most of the readings
 LEAST_TRUTH = 2  # rows; a single position fits any path
 LARGEST = {1: (1e3, "a step forward", "m"), 2: (1e4, "a turn", "rad"), 3: (1e3, "a step to the left", "m")}
 FARTHEST_M = 1e8  # of coordinates; those of maps reach 1e7
@@ -46,10 +49,10 @@ def _checked(recording: Recording, turns_heading: bool, known: Known) -> Recorde
     tables = dict(recording.tables)
     surveyed, mounted = tables.pop("beacon", None), tables.pop("antenna", None)
     _check_complete(recording)
-    tables = {kind: _usable(kind, table, warnings) for kind, table in tables.items()}
+    tables = {kind: in_seconds(_usable(kind, table, warnings), warnings) for kind, table in tables.items()}
     tables = ordered({kind: table for kind, table in tables.items() if len(table.values)}, warnings)
     truth_rows = true_positions(tables["truth"], "truth", warnings) if "truth" in tables else None
-    odometry = without_wild_steps(_motions(recording, tables), warnings)
+    odometry = without_wild_steps(_motions(recording, tables, warnings), warnings)
     odometry = _with_truth(_known_part(odometry, warnings), truth_rows, warnings)
     _check_steps(odometry)
     steps = bridged(Steps(odometry.values[:, 0], *(odometry.values[1:, column] for column in (1, 2, 3))))
@@ -83,7 +86,7 @@ def _checked(recording: Recording, turns_heading: bool, known: Known) -> Recorde
 
 
 def _usable(kind: str, table: Table, warnings: list[str]) -> Table:
-    if kind in MOTIONS:
+    if kind in {"odom", "speed"}:  # a pose that is not known says nothing, the next one has its motion
         return table.with_unknown_ways(warnings).finite(warnings, 1)
     return table.finite(warnings, needed_of(EVENTS[kind]))
 
@@ -91,12 +94,12 @@ def _usable(kind: str, table: Table, warnings: list[str]) -> Table:
 def _check_complete(recording: Recording) -> None:
     file, tables = recording.file, recording.tables
     if not any(kind in tables for kind in MOTIONS):
-        raise RadioDataError(file, f"no event odom ({', '.join(EVENTS['odom'])})")
+        raise RadioDataError(file, f"no event odom ({', '.join(EVENTS['odom'])}), speed or pose")
     if not any(kind in tables for kind in READING_KINDS):
         raise RadioDataError(file, f"no readings of beacons: no event {', '.join(READING_KINDS)}")
 
 
-def _motions(recording: Recording, tables: dict[str, Table]) -> Table:
+def _motions(recording: Recording, tables: dict[str, Table], warnings: list[str]) -> Table:
     """Rows of time and of the motion since the row before, shape (n, 4); those of the first row mean nothing."""
     if "odom" in tables:
         odometry = tables["odom"]
@@ -104,6 +107,8 @@ def _motions(recording: Recording, tables: dict[str, Table]) -> Table:
         file, values, lines = tables["speed"]
         moves = values[:-1, 1:] * np.diff(values[:, 0])[:, None]
         odometry = Table(file, np.column_stack([values[:, 0], np.vstack([np.zeros((1, 3)), moves])]), lines)
+    elif "pose" in tables:
+        odometry = motions_between(true_positions(tables["pose"], "odometry", warnings))
     else:
         raise RadioDataError(recording.file, "no row of the odometry has a time")
     if len(odometry.values) <= LEAST_STEPS:
@@ -133,8 +138,8 @@ def _known_part(odometry: Table, warnings: list[str]) -> Table:
     for what, row in (("begins", first), ("ends", last)):
         if row not in {0, len(t) - 1}:
             warnings.append(
-                f"{odometry.file.name}:{int(odometry.lines[row])}: the run {what} here, at {t[row]:.6g} s: the motion "
-                f"{'before' if what == 'begins' else 'after'} is not known"
+                f"{odometry.file.name}:{int(odometry.lines[row])}: the run {what} here, at {instant(t[row])}: the "
+                f"motion {'before' if what == 'begins' else 'after'} is not known"
             )
     return _part(odometry, first, last)
 
@@ -150,7 +155,7 @@ def _with_truth(odometry: Table, truth: Table | None, warnings: list[str]) -> Ta
         return odometry
     warnings.append(
         f"the truth begins {truth.values[0, 0] - t[0]:.6g} s after the odometry, while the vehicle moves: the run "
-        f"begins with it, at {t[begin]:.6g} s"
+        f"begins with it, at {instant(t[begin])}"
     )
     return _part(odometry, begin, last)
 
@@ -170,8 +175,8 @@ def _check_steps(odometry: Table) -> None:
             at = int(np.argmax(beyond))
             raise RadioDataError(
                 odometry.file,
-                f"odometry: {what} of {values[at]:.3g} {unit} at {odometry.values[at + 1, 0]:.6g} s cannot be; at most "
-                f"{most:g} is taken",
+                f"odometry: {what} of {values[at]:.3g} {unit} at {instant(odometry.values[at + 1, 0])} cannot be; at "
+                f"most {most:g} is taken",
                 int(odometry.lines[at + 1]),
             )
 
@@ -199,18 +204,31 @@ def _readings(
     if not merged:
         raise RadioDataError(recording.file, _no_readings(spans, steps, warnings))
     rows = sorted([(t, who, row) for (t, who), row in merged.items()] + extra, key=lambda item: item[0])
+    _check_names(recording, [int(who) for _, who, _ in rows])
     beacons, index = np.unique([int(who) for _, who, _ in rows], return_inverse=True)
     data = np.array([row for _, _, row in rows]).reshape(-1, len(READING_KINDS))
     readings = Readings(np.array([t for t, _, _ in rows]), index.astype(np.int64), *data.T.copy())
     return readings, tuple(recording.names[int(who)] for who in beacons)
 
 
+def _check_names(recording: Recording, beacons: list[int]) -> None:
+    """Raises RadioDataError: the readings are of so many beacons that their names are something else."""
+    once = [who for who, count in Counter(beacons).items() if count == 1]
+    if len(once) > max(MOST_ONCE, 0.5 * len(beacons)):
+        raise RadioDataError(
+            recording.file,
+            f"{len(once)} of {len(beacons)} readings are the only one of their beacon "
+            f"({listed([recording.names[who] for who in once], 4)}): is the name of the beacon a number of the row?",
+        )
+
+
 def _no_readings(times_s: list[float], steps: Steps, warnings: list[str]) -> str:
     if not times_s:
         return f"none of its readings can be used ({'; '.join(warnings[-3:])})"
     return (
-        f"no readings of beacons within the time of the odometry, {steps.times_s[0]:.6g} to {steps.times_s[-1]:.6g} s: "
-        f"theirs are {min(times_s):.6g} to {max(times_s):.6g} s; are both in s, and of one clock?"
+        f"no readings of beacons within the time of the odometry, {instant(steps.times_s[0])} to "
+        f"{instant(steps.times_s[-1])}: theirs are {instant(min(times_s))} to {instant(max(times_s))}; "
+        "are both in s, and of one clock?"
     )
 
 
@@ -287,7 +305,7 @@ def _in_the_plane(readings: Readings, above_m: FloatArray, warnings: list[str]) 
     if (short := (squares < 0.0) & (readings.range_m > 0.0)).any():
         warnings.append(
             f"{plural(int(short.sum()), 'range')} shorter than the beacon is above the antenna, not used, the first at "
-            f"{readings.times_s[int(np.argmax(short))]:.6g} s"
+            f"{instant(readings.times_s[int(np.argmax(short))])}"
         )
         readings = readings.where(~short)
         squares = squares[~short]

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from ccatp.beacons.cricket.map_fit import map_rms_m
 from ccatp.beacons.datasets.consistency import inconsistencies
-from ccatp.beacons.datasets.tables import GAP_S, long_pauses, plural
+from ccatp.beacons.datasets.tables import GAP_S, instant, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor
 from ccatp.beacons.estimation.recording import EstimatedPath, Readings, RecordedRun, ReferencePath, Steps
 from ccatp.beacons.rigid_motion import aligned_rms_m
@@ -215,8 +215,8 @@ def _gaps(run: RecordedRun) -> Iterator[str]:
             worst = int(long[np.argmax(pauses[long])])
             guessed = "; the way there is guessed by the speed before" if what == "odometry" else ""
             yield (
-                f"{what}: {plural(long.size, 'gap')}, the longest of {pauses[worst]:.1f} s at {times_s[worst]:.3f} s "
-                f"(usual interval {float(np.median(pauses[pauses > 0.0])):.3f} s){guessed}"
+                f"{what}: {plural(long.size, 'gap')}, the longest of {pauses[worst]:.1f} s at "
+                f"{instant(times_s[worst])} (usual interval {float(np.median(pauses[pauses > 0.0])):.3f} s){guessed}"
             )
 
 
@@ -370,6 +370,8 @@ def survey_doubts(track: EstimatedPath, surveyed_m: Mapping[str, tuple[float, fl
     for k, name in enumerate(names):
         line = f"beacon {name} was moved, or surveyed wrongly"
         fits_m[line] = aligned_rms_m(found[every != k], surveyed[every != k])
+    mirrored = "the map is the mirror image of the survey (turns of the odometry, or its y, have the other sign)"
+    fits_m[mirrored] = aligned_rms_m(found, surveyed * (1.0, -1.0))
     line, fit_m = min(fits_m.items(), key=lambda item: item[1])
     if fit_m > MENDED * miss_m:
         rows, places = [list(track.beacons).index(name) for name in names], list(track.beacons.values())
@@ -411,6 +413,6 @@ def sudden_disagreement(track: EstimatedPath) -> list[str]:
     if worst < SUDDEN:
         return []
     return [
-        f"readings of several beacons at once are off, at {at_s:.6g} s by {worst:.3g} times their expected squares: "
+        f"readings of several beacons at once are off, at {instant(at_s)} by {worst:.3g} times their expected squares: "
         "was the vehicle moved, or a clock set?"
     ]

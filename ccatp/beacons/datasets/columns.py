@@ -1,7 +1,8 @@
 """Recorded runs as tables with a header: readings by time and beacon in one file, odometry in another beside it."""
 
 import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,67 +11,29 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.datasets.events import EVENTS, READING_KINDS, Recording, is_events_csv, name_of
-from ccatp.beacons.datasets.placeholders import true_positions
+from ccatp.beacons.datasets.headers import SECONDS, Column, column_of
 from ccatp.beacons.datasets.tables import (
     COMMENTS,
     NotTextError,
     RadioDataError,
     Table,
+    beacon_name,
     content_lines,
     delimiter_of,
     is_number,
+    listed,
     number,
     read_text,
     split_cells,
     tables_of,
 )
-from ccatp.beacons.datasets.trajectory import motions_between
+from ccatp.beacons.datasets.tags import chosen_tag
 from ccatp.core import FloatArray
 
-# Headers of each quantity, in lower case with underscores, without unit; of several columns the earlier name counts.
-HEADERS = {
-    "time": ("time", "t", "timestamp", "stamp", "secs", "seconds"),
-    "beacon": (
-        "beacon", "anchor", "beacon_id", "anchor_id", "beaconid", "anchorid", "node", "node_id", "mote", "landmark",
-        "address", "id",
-    ),
-    "range": ("range", "distance", "dist", "r"),
-    "bearing": ("bearing", "aoa", "azimuth"),
-    "rssi": ("rssi", "level"),
-    "x": ("x", "pos_x", "position_x", "px", "tx"),
-    "y": ("y", "pos_y", "position_y", "py", "ty"),
-    "z": ("z", "pos_z", "position_z", "pz", "tz"),
-    "sigma": ("sigma", "std", "accuracy"),
-    "heading": ("heading", "yaw", "theta", "phi", "orientation"),
-    "qx": ("qx", "q_x", "orientation_x"),
-    "qy": ("qy", "q_y", "orientation_y"),
-    "qz": ("qz", "q_z", "orientation_z"),
-    "qw": ("qw", "q_w", "orientation_w"),
-    "speed": ("speed", "v", "vx", "velocity", "linear"),
-    "left": ("vy", "lateral_speed"),
-    "rate": ("w", "omega", "rate", "yaw_rate", "turn_rate", "wz", "angular"),
-    "turn": ("turn", "dtheta", "dyaw", "dphi"),
-}  # fmt: skip
+LEAST_COLUMNS = 3  # of a table of readings
 QUATERNION = ("qx", "qy", "qz", "qw")
-# Last words of columns beside that of a reading, which are none.
-OF_QUALITY = ("std", "stddev", "sigma", "var", "variance", "err", "error", "quality", "snr", "valid")
-NOTHING = ("", "nan", "n/a", "na", "null", "none", "-")  # cells without a value, in lower case
-UNITS = {
-    "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048,
-    "rad": 1.0, "deg": np.pi / 180.0, "dbm": 1.0, "m_s": 1.0, "m/s": 1.0, "mm/s": 1e-3, "rad_s": 1.0, "rad/s": 1.0,
-    "deg/s": np.pi / 180.0, "deg_s": np.pi / 180.0,
-}  # fmt: skip
-UNIT = re.compile(r"^(?P<name>.*?)(?:[ _]*[\[(](?P<bracket>[^\])]*)[\])]|_(?P<suffix>m_s|rad_s|deg_s|[a-z]+))?$")
-TRUTH_NAME = re.compile(r"truth|gt|ground|reference|mocap", re.IGNORECASE)
-
-
-class Column(NamedTuple):
-    """What a column has: quantity, beacon of a column of one beacon alone, factor to SI units, place of its name."""
-
-    quantity: str
-    beacon: str
-    factor: float
-    rank: int = 0
+NOTHING = ("", "nan", "n/a", "#n/a", "na", "null", "none", "-", "--")  # cells without a value, in lower case
+TRUTH_NAME = re.compile(r"truth|gt|ground|reference|mocap|vicon|optitrack|qualisys|rtk|gnss|gps", re.IGNORECASE)
 
 
 class ColumnFile(NamedTuple):
@@ -79,40 +42,41 @@ class ColumnFile(NamedTuple):
     file: Path
     columns: list[Column | None]
     rows: list[tuple[int, list[str]]]
+    places: Mapping[str, int]  # index of the column of each quantity: of several that with the earliest name
 
     @property
     def quantities(self) -> set[str]:
         """The quantities of its columns."""
-        return {column.quantity for column in self.columns if column}
+        return {*self.places}
 
     def values(self, *quantities: str) -> Table:
         """A table of some quantities; NaN for those that it lacks, and for empty cells."""
         found = np.full((len(self.rows), len(quantities)), np.nan)
         for row, (line, cells) in enumerate(self.rows):
             for place, quantity in enumerate(quantities):
-                k = self.column_of(quantity)
+                k = self.places.get(quantity)
                 if k is not None and cells[k]:
-                    found[row, place] = self.value(line, cells, k)
+                    found[row, place] = self.time_s(line, cells) if quantity == "time" else self.value(line, cells, k)
         return Table(self.file, found, np.array([line for line, _ in self.rows]))
 
-    def column_of(self, quantity: str) -> int | None:
-        """Index of the column of a quantity: of several that with the earliest of the names in ``HEADERS``."""
-        found = [(column.rank, k) for k, column in enumerate(self.columns) if column and column.quantity == quantity]
-        return min(found)[1] if found else None
-
     def value(self, line: int, cells: list[str], k: int) -> float:
-        """The value of a cell that is not empty, in SI units; of a date the time since 1970, by default in UTC."""
+        """The value of a cell that is not empty, in SI units."""
         column = self.columns[k]
-        if column is None:
+        return np.nan if column is None else column.factor * number(self.file, line, cells[k], column.quantity)
+
+    def time_s(self, line: int, cells: list[str]) -> float:
+        """The time of a row; of a date the time since 1970, by default in UTC. NaN if its cell is empty."""
+        k, fraction = self.places.get("time"), self.places.get("fraction")
+        if k is None or not cells[k]:
             return np.nan
-        if column.quantity == "time" and not is_number(cells[k]):
-            try:
+        if not is_number(cells[k]):
+            with suppress(ValueError):
                 date = datetime.fromisoformat(cells[k])
-            except ValueError:
-                date = None
-            if date is not None:
                 return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
-        return column.factor * number(self.file, line, cells[k], column.quantity)
+        time_s = self.value(line, cells, k)
+        if (column := self.columns[k]) and column.rank >= SECONDS and fraction is not None and cells[fraction]:
+            time_s += self.value(line, cells, fraction)
+        return time_s
 
     def poses(self) -> Table:
         """Rows of time, x, y and heading; the heading may be written as a quaternion."""
@@ -137,37 +101,43 @@ def is_columns(text: str) -> bool:
     )
 
 
-def read_columns(path: Path) -> Recording:
-    """Read a table of readings, and beside it those of odometry and, if there are, of truth and surveyed beacons.
+def read_columns(path: Path, tag: str = "") -> Recording:
+    """Read a table of readings, and beside it those of odometry and, if there are, of truth, beacons and tags.
 
-    ``path``: the table of readings, or a folder with one. Raises RadioDataError: one of the first two is missing.
+    ``path``: the table of readings, or a folder with one. ``tag``: the vehicle's radio whose readings are used. Raises
+    RadioDataError: one of the first two is missing.
     """
     folder = path if path.is_dir() else path.parent
     texts = _texts(folder)
     readings = [file for file, text in texts.items() if is_columns(text)] if path.is_dir() else [path]
     if len(readings) != 1:
         raise RadioDataError(path, f"holds {len(readings)} tables of readings: name one")
-    if not is_columns(text := read_text(readings[0])):
-        raise RadioDataError(readings[0], "has no header with a time and ranges, bearings or levels by beacon")
-    others = {file: text for file, text in texts.items() if file not in readings and _is_other_table(text)}
-    tables = {file: _read(file, text) for file, text in others.items()}
-    tracks = {file: one for file, one in tables.items() if "time" in one.quantities and _is_motion(one.quantities)}
-    truths = {file: one for file, one in tracks.items() if TRUTH_NAME.search(file.name)}
-    odometry = [one for file, one in tracks.items() if file not in truths]
+    file = readings[0]
+    if not is_columns(text := read_text(file)):
+        raise RadioDataError(file, "has no header with a time and ranges, bearings or levels by beacon")
+    others = {other: _read(other, text) for other, text in texts.items() if other != file and _is_other_table(text)}
+    tracks = {other: one for other, one in others.items() if "time" in one.quantities}
+    truths = [one for other, one in tracks.items() if TRUTH_NAME.search(other.name)]
+    odometry = [one for one in tracks.values() if one not in truths]
     if len(odometry) != 1 or len(truths) > 1:
         what = f"{len(odometry)} tables of odometry and {len(truths)} of truth"
         raise RadioDataError(
-            folder, f"has {what} beside {readings[0].name}: one with time and x, y, heading or speed, rate is needed"
+            folder, f"has {what} beside {file.name}: one with time and x, y, heading or speed, rate is needed"
         )
     warnings: list[str] = []
     numbers: dict[str, float] = {}
-    events = tables_of(readings[0], _readings(_read(readings[0], text), numbers))
-    events |= dict([_motion(odometry[0], warnings)])
-    for truth in truths.values():
-        events["truth"] = truth.poses()
-    for survey in (one for one in tables.values() if "time" not in one.quantities):
-        events["beacon"] = _survey(survey, numbers)
-    return Recording(readings[0], name_of(readings[0]), "csv", events, tuple(numbers), tuple(warnings))
+    table, tag = _of_one_tag(_read(file, text), tag, warnings)
+    events = tables_of(file, _readings(table, numbers))
+    events |= dict([_motion(odometry[0])])
+    if truths:
+        events["truth"] = truths[0].poses()
+    if (beside := _places_beside(table, numbers)) is not None:
+        events["beacon"] = beside
+    for other in (one for one in others.values() if "time" not in one.quantities):
+        events |= _antenna(other, tag) if "tag" in other.quantities else {"beacon": _survey(other, numbers)}
+    if warnings and "antenna" not in events:  # there are several tags, so not all are in the middle
+        warnings.append(f"the place of tag {tag} is not known (no table of tag, forward, left): it is taken as zero")
+    return Recording(file, name_of(file), "csv", events, tuple(numbers), tuple(warnings))
 
 
 def read_survey(file: Path, text: str) -> tuple[list[str], FloatArray, FloatArray]:
@@ -179,11 +149,22 @@ def read_survey(file: Path, text: str) -> tuple[list[str], FloatArray, FloatArra
     if not {"beacon", "x", "y"} <= {column.quantity for column in header if column}:
         raise RadioDataError(file, "has no header with beacon, x and y, so it is no map")
     table = _read(file, text)
-    at = table.column_of("beacon") or 0
-    names = [cells[at] for _, cells in table.rows]
+    at = table.places.get("beacon") or 0
+    names = [beacon_name(cells[at]) for _, cells in table.rows]
     if "" in names:
         raise RadioDataError(file, "the place has no name of a beacon", table.rows[names.index("")][0])
     return names, table.values("x", "y", "z").values, table.values("sigma").values[:, 0]
+
+
+def lacking(text: str) -> str:
+    """What the header of a text lacks to be one of readings; "" if it has no header, or that of another table."""
+    if len(columns := _header(text)) < LEAST_COLUMNS or _is_other_table(text):
+        return ""
+    found = {column.quantity for column in columns if column} | {"beacon" for one in columns if one and one.beacon}
+    wanted = {"a time": {"time"}, "the name of a beacon": {"beacon"}, "a range, bearing or rssi": {*READING_KINDS}}
+    missing = [what for what, names in wanted.items() if not found & names]
+    cells = split_cells(content := _first_line(text[:20_000])[1], delimiter_of(content))
+    return f"its header ({listed(cells)}) has no column with {' or '.join(missing)}" if missing else ""
 
 
 def _texts(folder: Path) -> dict[Path, str]:
@@ -214,29 +195,14 @@ def _header(text: str) -> list[Column | None]:
     cells = split_cells(content, delimiter_of(content))
     if not cells or any(is_number(cell) for cell in cells):
         return []
-    return [_column(cell) for cell in cells]
-
-
-def _column(header: str) -> Column | None:
-    text = header.strip().lower()
-    match = UNIT.match(text)
-    name, unit = (match["name"], match["bracket"] or match["suffix"] or "") if match else (text, "")
-    if unit not in UNITS:
-        name, unit = text, ""
-    words = name.strip().replace(" ", "_")
-    for quantity, names in HEADERS.items():
-        if words in names:
-            return Column(quantity, "", UNITS.get(unit, 1.0), names.index(words))
-    for quantity in READING_KINDS:  # a column of one beacon, as "range A", "dist_A" or "rssi_B [dBm]"
-        for synonym in HEADERS[quantity]:
-            if len(synonym) > 1 and words.startswith(f"{synonym}_") and words.split("_")[-1] not in OF_QUALITY:
-                return Column(quantity, header.strip()[len(synonym) + 1 : len(name)], UNITS.get(unit, 1.0))
-    return None
+    return [column_of(cell) for cell in cells]
 
 
 def _read(file: Path, text: str) -> ColumnFile:
     first, header = _first_line(text)
     mark, columns = delimiter_of(header), _header(text)
+    if problems := [column.problem for column in columns if column and column.problem]:
+        raise RadioDataError(file, problems[0], first)
     rows = []
     for line, content in content_lines(text):
         if line <= first:
@@ -247,7 +213,8 @@ def _read(file: Path, text: str) -> ColumnFile:
         rows.append((line, [*cells, *[""] * (len(columns) - len(cells))]))
     if not rows:
         raise RadioDataError(file, "holds no rows below its header")
-    return ColumnFile(file, columns, rows)
+    ranked = sorted((column.rank, k, column.quantity) for k, column in enumerate(columns) if column)
+    return ColumnFile(file, columns, rows, {quantity: k for _, k, quantity in reversed(ranked)})
 
 
 def _is_other_table(text: str) -> bool:
@@ -255,15 +222,32 @@ def _is_other_table(text: str) -> bool:
     quantities = {column.quantity for column in _header(text) if column}
     if is_events_csv(text):
         return False
-    return _is_motion(quantities) if "time" in quantities else {"beacon", "x", "y"} <= quantities
+    if "time" in quantities:
+        return _is_motion(quantities)
+    return {"beacon", "x", "y"} <= quantities or {"tag", "forward_m", "left_m"} <= quantities
 
 
 def _is_motion(quantities: set[str]) -> bool:
-    return {"x", "y"} <= quantities or {"speed", "rate"} <= quantities or {"turn"} <= quantities
+    return any(wanted <= quantities for wanted in ({"x", "y"}, {"speed", "rate"}, {"turn"}))
+
+
+def _of_one_tag(table: ColumnFile, wanted: str, warnings: list[str]) -> tuple[ColumnFile, str]:
+    """The readings of one of the vehicle's radios, and its name; "" if the table names none."""
+    at, named = table.places.get("tag"), table.places.get("beacon")
+    if at is None:
+        if wanted:
+            raise RadioDataError(table.file, f"has no column of tags, so none of tag {wanted}", 1)
+        return table, ""
+    names = [beacon_name(cells[at]) for _, cells in table.rows]
+    tag = chosen_tag(table.file, Counter(names), wanted, warnings)
+    if len({*names}) > 1 and named is not None and len({cells[named] for _, cells in table.rows}) == 1:
+        warnings.append(f"{table.file.name}: several tags and one beacon: are these two columns exchanged?")
+    rows = [row for row, name in zip(table.rows, names, strict=True) if name == tag]
+    return table._replace(rows=rows), tag
 
 
 def _readings(table: ColumnFile, numbers: dict[str, float]) -> Iterator[tuple[str, int, list[float]]]:
-    time, named = table.column_of("time"), table.column_of("beacon")
+    named = table.places.get("beacon")
     readings = [(k, column) for k, column in enumerate(table.columns) if column and column.quantity in READING_KINDS]
     if named is not None:  # beside a column of names, others than "range" itself are no beacons
         readings = [(k, column) for k, column in readings if not column.beacon]
@@ -272,29 +256,41 @@ def _readings(table: ColumnFile, numbers: dict[str, float]) -> Iterator[tuple[st
             what = "no column" if not kinds else "several columns"
             raise RadioDataError(table.file, f"{what} of a range, bearing or rssi beside the names of the beacons", 1)
     for line, cells in table.rows:
-        if time is None or not cells[time]:
+        if np.isnan(time_s := table.time_s(line, cells)):
             raise RadioDataError(table.file, "the reading has no time", line)
-        time_s = table.value(line, cells, time)
         for k, column in readings:
             if not cells[k]:
                 continue  # an empty cell: the beacon was not heard
-            name = column.beacon if named is None else cells[named]
+            name = beacon_name(column.beacon if named is None else cells[named])
             if not name:
                 raise RadioDataError(table.file, "the reading has no name of a beacon", line)
-            yield (
-                column.quantity,
-                line,
-                [time_s, numbers.setdefault(name, float(len(numbers))), table.value(line, cells, k)],
-            )
+            beacon = numbers.setdefault(name, float(len(numbers)))
+            yield column.quantity, line, [time_s, beacon, table.value(line, cells, k)]
 
 
-def _motion(table: ColumnFile, warnings: list[str]) -> tuple[str, Table]:
+def _places_beside(table: ColumnFile, numbers: dict[str, float]) -> Table | None:
+    """Places of the beacons beside their readings; those of a beacon that has several are not taken."""
+    named = table.places.get("beacon")
+    if named is None or not {"beacon_x", "beacon_y"} <= table.quantities:
+        return None
+    places = table.values("beacon_x", "beacon_y", "beacon_z")
+    index: FloatArray = np.array([numbers.get(beacon_name(cells[named]), np.nan) for _, cells in table.rows])
+    rows = np.flatnonzero(np.isfinite(index) & np.isfinite(places.values[:, :2]).all(axis=1))
+    found = np.column_stack([index, places.values])[rows]
+    first = np.unique(found[:, :3], axis=0, return_index=True)[1]
+    found, lines = found[first], places.lines[rows[first]]
+    alone = np.isin(found[:, 0], [beacon for beacon, count in Counter(found[:, 0].tolist()).items() if count == 1])
+    return Table(table.file, found[alone], lines[alone]) if alone.any() else None
+
+
+def _motion(table: ColumnFile) -> tuple[str, Table]:
     if {"x", "y"} <= table.quantities:
         if "heading" not in table.quantities and not {"qz", "qw"} <= table.quantities:
             raise RadioDataError(table.file, "odometry with x and y has no heading; give it, or speed and rate", 1)
-        poses = true_positions(table.poses(), "odometry", warnings)
-        return "odom", motions_between(poses)
+        return "pose", table.poses()
     kind, names = ("speed", ("speed", "rate")) if "speed" in table.quantities else ("odom", ("range", "turn"))
+    if not {*names} <= table.quantities:
+        raise RadioDataError(table.file, "odometry with a turn has no distance: time, distance, turn are needed", 1)
     moves = table.values("time", *names, "left")
     if "left" not in table.quantities:
         moves.values[:, 3] = 0.0
@@ -302,7 +298,16 @@ def _motion(table: ColumnFile, warnings: list[str]) -> tuple[str, Table]:
 
 
 def _survey(table: ColumnFile, numbers: dict[str, float]) -> Table:
-    at = table.column_of("beacon") or 0
-    names: FloatArray = np.array([numbers.setdefault(cells[at], float(len(numbers))) for _, cells in table.rows])
+    at = table.places.get("beacon") or 0
+    names: FloatArray = np.array(
+        [numbers.setdefault(beacon_name(cells[at]), float(len(numbers))) for _, cells in table.rows]
+    )
     places = table.values("x", "y", "z")
     return places._replace(values=np.column_stack([names, places.values])[:, : len(EVENTS["beacon"])])
+
+
+def _antenna(table: ColumnFile, tag: str) -> dict[str, Table]:
+    """The place of one of the vehicle's radios, if the table of their places has it."""
+    at = table.places.get("tag")
+    rows = [(line, cells) for line, cells in table.rows if at is not None and beacon_name(cells[at]) == tag]
+    return {"antenna": table._replace(rows=rows).values("forward_m", "left_m", "up_m")} if rows else {}

@@ -5,8 +5,17 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import numpy.typing as npt
 
+from ccatp.beacons.datasets.tables import instant
 from ccatp.beacons.datasets.trajectory import CONSTANT_RAD, STRAIGHT
-from ccatp.beacons.estimation.recording import BoolArray, Readings, RecordedRun, ReferencePath, Steps, dead_reckoned
+from ccatp.beacons.estimation.recording import (
+    BoolArray,
+    Readings,
+    RecordedRun,
+    ReferencePath,
+    Steps,
+    dead_reckoned,
+    running_total,
+)
 from ccatp.core import FloatArray, IntArray
 
 # An odometry that comes so rarely, s, at such a speed, m/s, has its times in another unit.
@@ -42,7 +51,7 @@ def inconsistencies(run: RecordedRun) -> Iterator[str]:
     """Warnings about units and clocks that need no truth, and of a truth with another clock than the odometry."""
     rare = list(_rare(run.steps))
     yield from rare
-    yield from _unturning(run.steps)
+    yield from _heading_against_course(run.steps)
     if rare:
         return
     path = dead_reckoned(run.steps, (0.0, 0.0, 0.0))
@@ -70,16 +79,25 @@ def _rare(steps: Steps) -> Iterator[str]:
         )
 
 
-def _unturning(steps: Steps) -> Iterator[str]:
-    """Poses without a heading: the vehicle moves in all directions and never turns."""
+def _heading_against_course(steps: Steps) -> Iterator[str]:
+    """Poses whose heading is none, or has the other sign: the vehicle moves in all directions relative to it."""
     moving = np.hypot(steps.distance_m, steps.lateral_m) > 0.0
-    course = np.arctan2(steps.lateral_m[moving], steps.distance_m[moving])
-    if np.abs(steps.turn_rad).max() >= CONSTANT_RAD or moving.sum() < FEWEST_PAIRS:
+    if moving.sum() < FEWEST_PAIRS:
         return
-    if abs(np.mean(np.exp(1j * course))) < STRAIGHT:
+    aside = np.arctan2(steps.lateral_m[moving], steps.distance_m[moving])
+    if abs(np.mean(np.exp(1j * aside))) >= STRAIGHT:
+        return
+    if np.abs(steps.turn_rad).max() < CONSTANT_RAD:
         yield (
             "the odometry never turns while its course does: its poses have no heading, so bearings and errors of "
             "the heading mean nothing"
+        )
+        return
+    heading = (running_total(steps.turn_rad)[:-1] + 0.5 * steps.turn_rad)[moving]
+    if abs(np.mean(np.exp(1j * (aside + 2.0 * heading)))) > STRAIGHT:  # course + heading is constant
+        yield (
+            "the heading of the odometry turns against the course of its positions: is it clockwise, as that of a "
+            "compass? Give it counter-clockwise from x"
         )
 
 
@@ -216,7 +234,7 @@ def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
         for lag_s, what in zip(lags[1:], ("first", "second"), strict=True):
             if lag_s:
                 yield (
-                    f"in the {what} half of the run (at {middle_s:.6g} s) ranges fit the odometry best "
+                    f"in the {what} half of the run (at {instant(middle_s)}) ranges fit the odometry best "
                     f"{_shifted(lag_s)}: was a clock set?"
                 )
         if not any(lags[1:]):

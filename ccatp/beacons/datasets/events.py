@@ -22,6 +22,7 @@ from ccatp.beacons.datasets.tables import (
 EVENTS = {
     "odom": ("time_s", "distance_m", "turn_rad", "(lateral_m)"),
     "speed": ("time_s", "speed_m_s", "turn_rad_s", "(lateral_m_s)"),
+    "pose": ("time_s", "x_m", "y_m", "heading_rad"),
     "range": ("time_s", "beacon", "range_m"),
     "bearing": ("time_s", "beacon", "bearing_rad"),
     "rssi": ("time_s", "beacon", "rssi_dbm"),
@@ -29,7 +30,7 @@ EVENTS = {
     "beacon": ("beacon", "x_m", "y_m", "(z_m)"),
     "antenna": ("forward_m", "left_m", "(up_m)"),
 }
-MOTIONS = ("odom", "speed")
+MOTIONS = ("odom", "speed", "pose")  # of several, the first there is used
 READING_KINDS = ("range", "bearing", "rssi")
 HEADER = "event"
 

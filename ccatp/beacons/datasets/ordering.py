@@ -5,11 +5,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from ccatp.beacons.datasets.tables import RadioDataError, Table, plural
+from ccatp.beacons.datasets.events import MOTIONS, READING_KINDS
+from ccatp.beacons.datasets.tables import RadioDataError, Table, instant, plural
 from ccatp.core import FloatArray
 
 LONGEST_PAUSE_S = 3600.0  # of the odometry; a longer one means that the clock was set
-TIMED = ("odom", "speed", "range", "bearing", "rssi", "truth")
+TIMED = (*MOTIONS, *READING_KINDS, "truth")
+# Times between 1973 and 5138 in these units; in s, they would be later than the year 5138.
+EPOCHS = (
+    (1e11, 1e14, 1e-3, "milliseconds"),
+    (1e14, 1e17, 1e-6, "microseconds"),
+    (1e17, 1e20, 1e-9, "nanoseconds"),
+)
 LEAST_OVERLAP = 3  # rows on each side whose times interleave after a clock was set back
 ASCENDING = 0.8  # share of ascending rows on both sides of it; shuffled rows have half
 NEAR = 20  # rows on each side that are looked at
@@ -20,20 +27,36 @@ def ordered(tables: Mapping[str, Table], warnings: list[str]) -> dict[str, Table
     """Tables by kind of event, each sorted by time, of one clock, without doubled rows.
 
     A clock that was set back or forward divides the recording into parts; the one with the longest odometry is kept.
-    Motions of equal times are added up; of equal times of truth or speed the last row counts. Rows must be finite,
-    except for motions that are unknown.
+    Motions of equal times are added up; of equal times of truth, poses or speeds the last row counts. Rows must be
+    finite, except for motions that are unknown.
     """
     found = dict(tables)
-    motion = "odom" if "odom" in found else "speed"
-    if motion in found:
+    motion = next((kind for kind in MOTIONS if kind in found), "")
+    if motion:
         found = _of_one_clock(found, motion, warnings)
     found = {kind: in_order(table, warnings) if kind in TIMED else table for kind, table in found.items()}
-    if motion in found:
+    if motion:
         found[motion] = _without_jumps(found[motion], warnings)
         found[motion] = _of_distinct_times(found[motion], "odometry", warnings, adds_up=motion == "odom")
     if "truth" in found:
         found["truth"] = _of_distinct_times(found["truth"], "truth", warnings, adds_up=False)
     return found
+
+
+def in_seconds(table: Table, warnings: list[str]) -> Table:
+    """The rows with times in seconds, if they are in milli-, micro- or nanoseconds since 1970.
+
+    ``table``: times in the first column.
+    """
+    if not len(table.values):
+        return table
+    with np.errstate(all="ignore"):
+        usual = float(np.nanmedian(table.values[:, 0]))
+    for least, most, factor, unit in EPOCHS:
+        if least < usual < most:
+            warnings.append(f"{table.file.name}: times of {usual:.4g} are taken as {unit} since 1970")
+            return table._replace(values=np.column_stack([factor * table.values[:, 0], table.values[:, 1:]]))
+    return table
 
 
 def in_order(table: Table, warnings: list[str]) -> Table:
@@ -98,9 +121,9 @@ def _of_one_clock(tables: dict[str, Table], motion: str, warnings: list[str]) ->
         for row in own:
             warnings.append(
                 f"{table.file.name}:{int(table.lines[row])}: {kind}: the clock was set back by "
-                f"{table.values[row - 1, 0] - table.values[row, 0]:.6g} s at {table.values[row - 1, 0]:.6g} s: of "
+                f"{table.values[row - 1, 0] - table.values[row, 0]:.6g} s at {instant(table.values[row - 1, 0])}: of "
                 f"{len(own_parts)} parts only the one of {spans_s[part]:.6g} s from "
-                f"{table.values[own_parts[part], 0].min():.6g} s on is used"
+                f"{instant(table.values[own_parts[part], 0].min())} on is used"
             )
     return found
 
@@ -135,9 +158,9 @@ def _without_jumps(odometry: Table, warnings: list[str]) -> Table:
     longest = max(parts, key=lambda part: part.stop - part.start)
     line = int(odometry.lines[jumps[0]])
     warnings.append(
-        f"{odometry.file.name}:{line}: odometry pauses for {pauses_s[jumps[0] - 1]:.3g} s at {t[jumps[0] - 1]:.6g} s: "
-        f"was the clock set? Only the part with most rows is used, {plural(longest.stop - longest.start, 'row')} of "
-        f"{len(t)} from {t[longest.start]:.6g} s on"
+        f"{odometry.file.name}:{line}: odometry pauses for {pauses_s[jumps[0] - 1]:.3g} s at "
+        f"{instant(t[jumps[0] - 1])}: was the clock set? Only the part with most rows is used, "
+        f"{plural(longest.stop - longest.start, 'row')} of {len(t)} from {instant(t[longest.start])} on"
     )
     return Table(odometry.file, odometry.values[longest], odometry.lines[longest])
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ccatp.beacons.datasets.tables import Table, plural
+from ccatp.beacons.datasets.tables import Table, instant, plural
 from ccatp.beacons.estimation.recording import BoolArray
 from ccatp.core import FloatArray
 
@@ -41,7 +41,7 @@ def measured(kind: str, table: Table, warnings: list[str]) -> Table:
     beyond = ~(np.abs(values) <= most)
     if beyond.any():
         first = int(np.argmax(beyond))
-        line = f"beyond {most:g} {unit}, the first {values[first]:.3g} {unit} at {table.values[first, 0]:.6g} s"
+        line = f"beyond {most:g} {unit}, the first {values[first]:.3g} {unit} at {instant(table.values[first, 0])}"
         warnings.append(f"{plural(int(beyond.sum()), WHAT[kind])} {line}, not used")
         table = table.where(~beyond)
     for value in placeholder_values(kind, table.values[:, 1], table.values[:, 2]):
@@ -49,7 +49,7 @@ def measured(kind: str, table: Table, warnings: list[str]) -> Table:
         first = int(np.argmax(is_it))
         warnings.append(
             f"{plural(int(is_it.sum()), WHAT[kind])} of {value:.6g} {unit}, the first at "
-            f"{table.values[first, 0]:.6g} s ({table.file.name}:{int(table.lines[first])}), not used: "
+            f"{instant(table.values[first, 0])} ({table.file.name}:{int(table.lines[first])}), not used: "
             "a placeholder, not a measurement"
         )
         table = table.where(~is_it)
@@ -103,7 +103,7 @@ def frozen(kind: str, table: Table, way_m: FloatArray, names: tuple[str, ...], w
                 begin_s, value = table.values[run[0], [0, 2]].tolist()
                 warnings.append(
                     f"{table.file.name}:{int(table.lines[run[1]])}: {WHAT[kind]} of beacon {names[int(beacon)]} "
-                    f"repeats {value:.6g} {run.size} times from {begin_s:.6g} s on, while the vehicle travels "
+                    f"repeats {value:.6g} {run.size} times from {instant(begin_s)} on, while the vehicle travels "
                     f"{way_m[run[-1]] - way_m[run[0]]:.3g} m: used once"
                 )
     return table.where(~stale) if stale.any() else table
@@ -130,7 +130,7 @@ def without_wild_steps(odometry: Table, warnings: list[str]) -> Table:
         warnings.append(
             f"{odometry.file.name}:{int(odometry.lines[first])}: {plural(int(beyond.sum()), 'step')} of the odometry "
             f"{what} beyond what the run does otherwise (at most {most:.3g} {unit}/s is taken), the first of "
-            f"{odometry.values[first, column]:.3g} {unit} at {odometry.values[first, 0]:.6g} s: taken as a gap"
+            f"{odometry.values[first, column]:.3g} {unit} at {instant(odometry.values[first, 0])}: taken as a gap"
         )
         wild[1:] |= beyond
     if not wild.any():
@@ -184,4 +184,4 @@ def true_positions(truth: Table, what: str, warnings: list[str]) -> Table:
 
 
 def _first_s(table: Table, rows: BoolArray) -> str:
-    return f"{table.values[int(np.argmax(rows)), 0]:.6g} s"
+    return instant(table.values[int(np.argmax(rows)), 0])

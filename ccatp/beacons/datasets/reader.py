@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ccatp.beacons.datasets.assembly import NOTHING, checked_run
-from ccatp.beacons.datasets.columns import is_columns, read_columns
+from ccatp.beacons.datasets.columns import is_columns, lacking, read_columns
 from ccatp.beacons.datasets.events import is_events_csv, read_events_csv
 from ccatp.beacons.datasets.formats import (
     ROBOT_FILE,
@@ -27,29 +27,34 @@ READERS = {
     "plaza": read_plaza,
     "labyrinth": read_labyrinth,
     "csv": read_events_csv,
-    "columns": read_columns,
     "pyfg": read_pyfg,
 }
+TAGGED = ("columns", "bag")
 FORMATS = ("plaza", "mrclam", "labyrinth", "csv", "columns", "pyfg", "bag")
 
 
 def read_run(
     path: Path, data_format: str | None, robot: int | None, topics_file: Path | None = None,
-    *, turns_heading: bool = True, known: Known = NOTHING,
+    *, tag: str = "", turns_heading: bool = True, known: Known = NOTHING,
 ) -> RecordedRun:  # fmt: skip
     """Read and check a recorded run.
 
     ``data_format``: one of ``FORMATS``; detected from the files if ``None``. ``topics_file``: only for a bag.
-    ``turns_heading``, ``known``: see ``checked_run``. Raises RadioDataError: it cannot be read, or has another format.
+    ``tag``: the vehicle's radio whose readings are used, if it has several; else the one with most. ``turns_heading``,
+    ``known``: see ``checked_run``. Raises RadioDataError: it cannot be read, or has another format.
     """
     data_format = found_format(path, data_format)
     if robot is not None and data_format != "mrclam":
         raise RadioDataError(path, f"a {data_format} set has one vehicle: leave out --robot")
+    if tag and data_format not in TAGGED:
+        raise RadioDataError(path, f"a {data_format} set names no tags: leave out --tag")
     try:
         if data_format == "mrclam":
             recording = read_mrclam(path, robot)
+        elif data_format == "bag":
+            recording = read_bag(path, topics_file, tag)
         else:
-            recording = read_bag(path, topics_file) if data_format == "bag" else READERS[data_format](path)
+            recording = read_columns(path, tag) if data_format == "columns" else READERS[data_format](path)
         return checked_run(recording, turns_heading=turns_heading, known=known)
     except RadioDataError as error:
         raise error.with_page() from error
@@ -91,7 +96,10 @@ def _detected(path: Path) -> str:
             return "csv"
         if is_pyfg(text):
             return "pyfg"
-    raise RadioDataError(path, f"none of the formats {', '.join(FORMATS)}; if it is one, name it with --format")
+    what = f"none of the formats {', '.join(FORMATS)}; if it is one, name it with --format"
+    if lacks := next(filter(None, map(lacking, texts)), ""):
+        what = f"none of the formats {', '.join(FORMATS)}; as a table of readings, {lacks}"
+    raise RadioDataError(path, what)
 
 
 def _texts_beside_others(files: Sequence[Path]) -> list[str]:

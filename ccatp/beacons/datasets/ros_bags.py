@@ -14,9 +14,8 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from ccatp.beacons.datasets.events import Recording, name_of
-from ccatp.beacons.datasets.placeholders import true_positions
 from ccatp.beacons.datasets.tables import RadioDataError, tables_of
-from ccatp.beacons.datasets.trajectory import motions_between
+from ccatp.beacons.datasets.tags import chosen_tag
 from ccatp.config.files import read_input
 from ccatp.config.models import Model
 
@@ -88,16 +87,20 @@ class _Found:
         self.places: dict[str, tuple[float, ...]] = {}
 
 
-def read_bag(path: Path, topics_file: Path | None) -> Recording:
+def read_bag(path: Path, topics_file: Path | None, tag: str = "") -> Recording:
     """Read a run. Times are those of the message headers, or of the recorder for messages without one.
 
-    Raises RadioDataError: rosbags is not installed, or the bag or its topics are invalid.
+    ``tag``: in place of ``use_tag``. Raises RadioDataError: rosbags is not installed, or the bag or its
+    topics are invalid.
     """
     if topics_file is None:
         raise RadioDataError(path, "is a bag: give a TOML file that names its topics with --topics")
     topics, warnings = read_topics(topics_file), list[str]()
     found = _read(path, topics, warnings)
-    tag = _chosen_tag(path, topics, found, warnings)
+    counts = {name: len(rows) for name, rows in found.by_tag.items()}
+    tag = chosen_tag(path, counts, tag or topics.use_tag, warnings)
+    if tag and topics.tags and tag not in topics.tags:
+        warnings.append(f"the place of tag {tag} is not given: antenna_m is taken")
     rows = found.rows + found.by_tag.get(tag, [])
     for name, place in {**found.places, **topics.beacons}.items():
         rows.append(("beacon", 0, [_number(found.numbers, name), *place, *[np.nan] * (3 - len(place))]))
@@ -105,24 +108,9 @@ def read_bag(path: Path, topics_file: Path | None) -> Recording:
     if any(antenna_m):
         rows.append(("antenna", 0, [*antenna_m, *[0.0] * (3 - len(antenna_m))]))
     tables = tables_of(path, rows)
-    if (poses := tables.pop("pose", None)) is not None:
-        if np.isnan(poses.values[:, 3]).all():
-            raise RadioDataError(path, f"{topics.odometry.topic} has no orientations: no odometry comes from it")
-        tables["odom"] = motions_between(true_positions(poses, "odometry", warnings))
+    if (poses := tables.get("pose")) is not None and np.isnan(poses.values[:, 3]).all():
+        raise RadioDataError(path, f"{topics.odometry.topic} has no orientations: no odometry comes from it")
     return Recording(path, name_of(path), "csv", tables, tuple(found.numbers), tuple(warnings))
-
-
-def _chosen_tag(path: Path, topics: Topics, found: _Found, warnings: list[str]) -> str:
-    counts = {tag: len(rows) for tag, rows in found.by_tag.items()}
-    tag = topics.use_tag or max(counts, key=lambda one: counts[one], default="")
-    if topics.use_tag and tag not in counts:
-        raise RadioDataError(path, f"has no reading of tag {tag}; there are {', '.join(counts) or 'none'}")
-    if tag and topics.tags and tag not in topics.tags:
-        warnings.append(f"the place of tag {tag} is not given: antenna_m is taken")
-    if len(counts) > 1:
-        others = ", ".join(f"{one} ({count})" for one, count in counts.items() if one != tag)
-        warnings.append(f"readings of tag {tag} are used, those of the tags {others} are not: use_tag chooses another")
-    return tag
 
 
 def read_topics(file: Path) -> Topics:

@@ -44,6 +44,7 @@ UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1f]")  # bytes that no text of one byte a character has
 COMMENTS = ("#", "%", "//")
 DELIMITERS = ";\t,"  # of cells, in this order: beside another one, a comma is the decimal mark
+WHOLE = re.compile(r"\d+\.0+")
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 UNOMITTABLE = ("time_s", "time [s]", "x_m", "y_m", "forward_m", "left_m")  # columns that no cell may leave empty
 GAP_S = 2.0  # shorter pauses are normal for recorders,
@@ -132,6 +133,16 @@ def number(file: Path, line: int, text: str, what: str) -> float:
         return float(text)
     except ValueError as error:
         raise RadioDataError(file, f"{what} is {text[:40]!r}, not a number", line) from error
+
+
+def beacon_name(cell: str) -> str:
+    """The name of a beacon in a cell: ``7.0``, as tables with missing numbers have it, is ``7``."""
+    return cell.partition(".")[0] if WHOLE.fullmatch(cell) else cell
+
+
+def instant(time_s: float) -> str:
+    """A time for a message, to a millisecond: six digits of a clock that began in 1970 would be a week."""
+    return f"{time_s:.3f}".rstrip("0").rstrip(".") + " s"
 
 
 def is_number(text: str) -> bool:
@@ -231,7 +242,7 @@ def tagged_row(
             is_nothing = not cell and column not in UNOMITTABLE
             values.append(np.nan if is_nothing else number(file, line, cell, column.strip("()")))
         elif cell:
-            values.append(names.setdefault(cell, float(len(names))))
+            values.append(names.setdefault(beacon_name(cell), float(len(names))))
         else:
             raise RadioDataError(file, f"{kind} has no name of a beacon", line)
     missing = 0.0 if kind in {"odom", "speed"} else np.nan  # no travel sideways; heading unknown

@@ -143,7 +143,7 @@ REFUSED = [
         for at in ("nan 0.5", "-3 0.5", "1 inf", "inf 0")
     ),
     ("radio slam missing", "missing: no such file or folder"),
-    ("radio slam sheets", "name it with --format"),
+    ("radio slam sheets", "its header (x, y, RSSI A, RSSI B, RSSI C) has no column with a time"),
     ("radio slam sheets --format labyrinth", "holds no Labyrinth text"),
     ("radio slam mine.csv --robot 1", "a csv set has one vehicle: leave out --robot"),
     ("radio slam mine.csv --format labyrinth", "mine.csv:2: 'event,time_s,...' is none of range2"),

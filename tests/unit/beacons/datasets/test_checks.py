@@ -186,6 +186,7 @@ def mapped(names: str = "6789", sigma_m: float = 0.05) -> EstimatedPath:
         ({}, ""),
         ({"6": BEACONS["8"], "8": BEACONS["6"]}, "beacons 6 and 8 look exchanged in the survey: the map misses"),
         ({"7": (9.5, 8.5)}, "beacon 7 was moved, or surveyed wrongly: the map misses the survey by 1"),
+        ({name: (y, x) for name, (x, y) in BEACONS.items()}, "the map is the mirror image of the survey (turns of"),
         ({"6": (3.0, 9.0), "7": (0.0, -3.0)}, "are expected: one of them is wrong"),  # neither makes it fit
     ],
 )

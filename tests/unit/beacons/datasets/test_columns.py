@@ -73,6 +73,38 @@ def as_evo_writes(folder: Path) -> Path:
     return write_lines(folder / "uwb.csv", lines_of("# time," + ",".join(f"dist_{name}" for name in NAMES), rows))
 
 
+def newest_first(folder: Path) -> Path:
+    long_form(folder)
+    for name in ("odometry.csv", "uwb.csv", "ground_truth.csv"):
+        header, *rows = (folder / name).read_text(encoding="utf-8").splitlines()
+        write_lines(folder / name, [header, *reversed(rows)])
+    return folder
+
+
+def parted(time_s: float) -> tuple[int, int]:
+    """Seconds and nanoseconds."""
+    nanoseconds = round(1e9 * time_s)
+    return nanoseconds // 10**9, nanoseconds % 10**9
+
+
+def as_messages(folder: Path) -> Path:
+    long_form(folder)
+    poses = [(*parted(t), 7.0, x, y, 0, 0, 0, np.sin(0.5 * h), np.cos(0.5 * h)) for t, x, y, h in POSES]
+    position, turn = "pose.pose.position.", "pose.pose.orientation."
+    fields = [*(position + axis for axis in "xyz"), *(turn + axis for axis in "xyzw")]
+    head = ["header.stamp.sec", "header.stamp.nanosec", "twist.twist.linear.x", *fields]
+    write_lines(folder / "odometry.csv", lines_of(",".join(head), poses))
+    rows: list[tuple[object, ...]] = [(*parted(t), name, r) for t, name, r in RANGES]
+    return write_lines(folder / "uwb.csv", lines_of("secs,nsecs,field.anchor_id,field.range", rows))
+
+
+def with_places_beside_the_ranges(folder: Path) -> Path:
+    long_form(folder)
+    (folder / "anchors.csv").unlink()
+    rows: list[tuple[object, ...]] = [(t, f"{name}.0", r, *BEACONS[name]) for t, name, r in RANGES]
+    return write_lines(folder / "uwb.csv", lines_of("time,anchor,range,anchor_x,anchor_y", rows))
+
+
 def as_graph(folder: Path) -> Path:
     run = read_run(write_lines(folder / "run.csv", csv_lines(W)), None, None)
     lines = pyfg_lines(run, load_recordings_config().csv, np.column_stack(run.truth[1:]) if run.truth else W.poses)
@@ -81,8 +113,12 @@ def as_graph(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "make", [long_form, in_units, wide_form, with_decimal_commas, as_pandas_writes, as_evo_writes, as_graph]
-)
+    "make",
+    [
+        long_form, in_units, wide_form, with_decimal_commas, as_pandas_writes, as_evo_writes, as_graph, newest_first,
+        as_messages, with_places_beside_the_ranges,
+    ],
+)  # fmt: skip
 def test_the_same_run_comes_from_tables_and_from_a_graph(make: Callable[[Path], Path], tmp_path: Path) -> None:
     found = read_run(make(tmp_path), None, None)
     np.testing.assert_allclose(np.sort(found.readings.range_m), np.sort(W.range_m), atol=1e-7)
@@ -117,11 +153,13 @@ def rewritten(folder: Path, *lines: str) -> Path:
         (lambda folder: write_lines(folder / "odometry.csv", ["time,x,y,yaw"]), "holds no rows below its header"),
         (lambda folder: rewritten(folder, "time,anchor,range"), "holds no rows below"),
         (lambda folder: rewritten(folder, "time,anchor,range,dist", "1,A,2,3"), "csv:1: several columns of a range"),
-        (lambda folder: rewritten(folder, "time,id,range_raw", "1,A,2"), "csv:1: no column of a range"),
+        (lambda folder: rewritten(folder, "time,id,range_raw", "1,A,2"), "has no column with a range"),
         (lambda folder: rewritten(folder, "time,id,range", "1,A,2,3"), "csv:2: 4 cells below a header of 3"),
         (lambda folder: rewritten(folder, "time,id,range", ",A,2"), "csv:2: the reading has no time"),
         (lambda folder: rewritten(folder, "time,id,range", "1,,2"), "csv:2: the reading has no name"),
         (lambda folder: rewritten(folder, "time,id,range", "noon,A,2"), "csv:2: time is 'noon', not a number"),
+        (lambda folder: rewritten(folder, "time,id,range [ns]", "1,A,2"), "csv:1: column .*: 'ns' is no unit"),
+        (lambda folder: write_lines(folder / "odometry.csv", ["time,dx,dtheta", "0,1,0"]), "a turn has no distance"),
         (lambda folder: write_lines(folder / "more.csv", ["time,x,y,yaw", "0,0,0,0"]), "has 2 tables of odometry"),
     ],
 )  # fmt: skip
@@ -166,3 +204,88 @@ def test_a_graph_without_times_of_several_vehicles_with_loop_closures(tmp_path: 
     assert "1 range between vehicles not used" in said
     assert run.readings.range_m.tolist() == [4.0, 5.0]
     assert run.readings.times_s.tolist() == [2.0, 3.0]
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
+def test_times_since_1970_in_another_unit_are_recognised(factor: float, unit: str, tmp_path: Path) -> None:
+    since_s = 1_714_557_600
+    long_form(tmp_path)
+    rows: list[tuple[object, ...]] = [(round((since_s + t) * 1e3) * round(factor / 1e3), n, r) for t, n, r in RANGES]
+    write_lines(tmp_path / "uwb.csv", lines_of("timestamp,anchor,range", rows))
+    poses = [(since_s + t, *pose) for t, *pose in POSES]
+    write_lines(tmp_path / "odometry.csv", lines_of("time,x,y,yaw", poses))
+    (tmp_path / "ground_truth.csv").unlink()
+    run = read_run(tmp_path, None, None)
+    assert f"uwb.csv: times of 1.715e+{8 + len(str(round(factor)))} are taken as {unit} since 1970" in run.warnings
+    np.testing.assert_allclose(run.readings.times_s - since_s, W.read_s, atol=1e-3)
+
+
+def test_the_readings_of_one_tag_are_used_at_its_place(tmp_path: Path) -> None:
+    long_form(tmp_path)
+    rows: list[tuple[object, ...]] = [(t, 1 + k % 3 // 2, n, r) for k, (t, n, r) in enumerate(RANGES)]
+    file = write_lines(tmp_path / "uwb.csv", lines_of("time,tag_id,anchor,range", rows))
+    run = read_run(file, None, None)
+    said = " | ".join(run.warnings)
+    assert run.readings.range_m.tolist() == [r for k, (_, _, r) in enumerate(RANGES) if k % 3 < 2]
+    assert f"readings of tag 1 ({len(run.readings.times_s)}) are used, those of the tags 2 (" in said
+    assert "the place of tag 1 is not known" in said
+    write_lines(tmp_path / "tags.csv", ["tag,forward,left,up", "1,0.4,0.1,0.3", "2,-0.4,-0.1,0.3"])
+    other = read_run(file, None, None, tag="2")
+    assert other.readings.range_m.tolist() == [r for k, (_, _, r) in enumerate(RANGES) if k % 3 == 2]
+    assert other.antenna_m == (-0.4, -0.1)
+    assert "is not known" not in " | ".join(other.warnings)
+    with pytest.raises(RadioDataError, match="has no reading of tag 3; there are 1, 2"):
+        read_run(file, None, None, tag="3")
+
+
+def test_tags_and_beacons_that_are_exchanged_are_named(tmp_path: Path) -> None:
+    long_form(tmp_path)
+    rows: list[tuple[object, ...]] = [(t, name, "vehicle", r) for t, name, r in RANGES]
+    run = read_run(write_lines(tmp_path / "uwb.csv", lines_of("time,src,id,range", rows)), None, None)
+    assert any("several tags and one beacon: are these two columns exchanged?" in line for line in run.warnings)
+
+
+@pytest.mark.parametrize(
+    ("name", "lines", "what"),
+    [
+        ("uwb.csv", ["time,anchor,range", "1,A,2"], "has no column of tags, so none of tag 2"),
+        ("run.csv", ["odom,0,0,0"], "a csv set names no tags: leave out --tag"),
+    ],
+)
+def test_a_tag_that_no_column_names_is_refused(name: str, lines: list[str], what: str, tmp_path: Path) -> None:
+    long_form(tmp_path)
+    with pytest.raises(RadioDataError, match=what):
+        read_run(write_lines(tmp_path / name, lines), None, None, tag="2")
+
+
+@pytest.mark.parametrize(
+    ("header", "what"),
+    [
+        (
+            "Zeit,Anker,Distanz",
+            r"its header \(Zeit, Anker, Distanz\) has no column with a time or the name of a beacon",
+        ),
+        ("time,A1,A2,A3", "has no column with the name of a beacon or a range, bearing or rssi"),
+    ],
+)
+def test_a_header_that_is_not_understood_is_told(header: str, what: str, tmp_path: Path) -> None:
+    long_form(tmp_path)
+    rewritten(tmp_path, header, *(["1,2,3,4"[: len(header.split(",")) * 2 - 1]] * 5))
+    with pytest.raises(RadioDataError, match=what):
+        read_run(tmp_path, None, None)
+
+
+def test_beacons_that_are_heard_once_each_are_no_beacons(tmp_path: Path) -> None:
+    long_form(tmp_path)
+    rows: list[tuple[object, ...]] = [(t, k, r) for k, (t, _, r) in enumerate(RANGES)]
+    file = write_lines(tmp_path / "uwb.csv", lines_of("time,id,range", rows))
+    with pytest.raises(RadioDataError, match=r"the only one of their beacon \(0, 1, 2, 3 and .*a number of the row"):
+        read_run(file, None, None)
+
+
+def test_a_heading_that_turns_against_the_course_is_named(tmp_path: Path) -> None:
+    long_form(tmp_path)
+    write_lines(tmp_path / "odometry.csv", lines_of("time,x,y,yaw", [(t, x, y, 1.57 - h) for t, x, y, h in POSES]))
+    run = read_run(tmp_path, None, None)
+    assert any("turns against the course of its positions: is it clockwise" in line for line in run.warnings)
+    assert not any("clockwise" in line for line in read_run(long_form(tmp_path), None, None).warnings)

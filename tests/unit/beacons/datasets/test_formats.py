@@ -406,7 +406,7 @@ FAULTS: list[tuple[Make, str | None, str]] = [
         r"data\.txt:2: the distance between the wheels is not positive",
     ),
     (_text("", "# a comment"), None, r"data\.txt: is empty: no line but comments"),
-    (_with("lidar,1,2"), None, rf"mine\.csv:{LAST}: 'lidar' is none of odom, speed, range"),
+    (_with("lidar,1,2"), None, rf"mine\.csv:{LAST}: 'lidar' is none of odom, speed, pose, range"),
     (_with("range,1,6"), None, rf"mine\.csv:{LAST}: 2 values after range, wanted time_s, beacon, range_m"),
     (_with("range,soon,6,2"), None, rf"mine\.csv:{LAST}: time_s is 'soon', not a number"),
     (_text("range,1,6,2.0"), None, r"data\.txt: no event odom \(time_s, distance_m, turn_rad"),

@@ -146,7 +146,10 @@ def test_one_of_several_tags_in_millimetres_and_beacons_from_markers(use: str, k
     np.testing.assert_allclose(np.sort(found.readings.range_m), np.sort(w.range_m[kept::2]), atol=1e-5)
     assert found.antenna_m == ((0.3, 0.0), (0.0, 0.2))[kept]
     assert dict(found.beacon_truth_m) == BEACONS
-    assert f"readings of tag {kept} are used, those of the tags {1 - kept} (" in " | ".join(found.warnings)
+    assert (
+        f"readings of tag {kept} ({len(found.readings.times_s)}) are used, those of the tags {1 - kept} ("
+        in " | ".join(found.warnings)
+    )
     topics.write_text('use_tag = "7"' + topics.read_text().removeprefix(use))
     with pytest.raises(RadioDataError, match="has no reading of tag 7; there are 0, 1"):
         read_run(tmp_path / "run" / "run.mcap", None, None, topics)
