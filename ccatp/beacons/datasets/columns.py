@@ -105,7 +105,7 @@ def read_columns(path: Path, tag: str = "") -> Recording:
     """Read a table of readings, and beside it those of odometry and, if there are, of truth, beacons and tags.
 
     ``path``: the table of readings, or a folder with one. ``tag``: the vehicle's radio whose readings are used. Raises
-    RadioDataError: one of the first two is missing.
+    RadioDataError: one of the first two is missing, or there are several of one of the others.
     """
     folder = path if path.is_dir() else path.parent
     texts = _texts(folder)
@@ -124,6 +124,15 @@ def read_columns(path: Path, tag: str = "") -> Recording:
         raise RadioDataError(
             folder, f"has {what} beside {file.name}: one with time and x, y, heading or speed, rate is needed"
         )
+    still = {other: one for other, one in others.items() if "time" not in one.quantities}
+    mounts = {other: one for other, one in still.items() if "tag" in one.quantities}
+    surveys = {other: one for other, one in still.items() if other not in mounts}
+    for what, found in (("surveyed beacons", surveys), ("places of tags", mounts)):
+        if len(found) > 1:
+            names = listed([other.name for other in found])
+            raise RadioDataError(
+                folder, f"has {len(found)} tables of {what} beside {file.name}: {names}; leave one in the folder"
+            )
     warnings: list[str] = []
     numbers: dict[str, float] = {}
     table, tag = _of_one_tag(_read(file, text), tag, warnings)
@@ -133,8 +142,10 @@ def read_columns(path: Path, tag: str = "") -> Recording:
         events["truth"] = truths[0].poses()
     if (beside := _places_beside(table, numbers)) is not None:
         events["beacon"] = beside
-    for other in (one for one in others.values() if "time" not in one.quantities):
-        events |= _antenna(other, tag) if "tag" in other.quantities else {"beacon": _survey(other, numbers)}
+    for survey in surveys.values():
+        events["beacon"] = _survey(survey, numbers)
+    for mount in mounts.values():
+        events |= _antenna(mount, tag)
     if warnings and "antenna" not in events:  # there are several tags, so not all are in the middle
         warnings.append(f"the place of tag {tag} is not known (no table of tag, forward, left): it is taken as zero")
     return Recording(file, name_of(file), "csv", events, tuple(numbers), tuple(warnings))

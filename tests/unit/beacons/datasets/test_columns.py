@@ -161,6 +161,14 @@ def rewritten(folder: Path, *lines: str) -> Path:
         (lambda folder: rewritten(folder, "time,id,range [ns]", "1,A,2"), "csv:1: column .*: 'ns' is no unit"),
         (lambda folder: write_lines(folder / "odometry.csv", ["time,dx,dtheta", "0,1,0"]), "a turn has no distance"),
         (lambda folder: write_lines(folder / "more.csv", ["time,x,y,yaw", "0,0,0,0"]), "has 2 tables of odometry"),
+        (
+            lambda folder: write_lines(folder / "old.csv", ["anchor,x,y", "6,9,9"]),
+            r"has 2 tables of surveyed beacons beside uwb\.csv: anchors\.csv, old\.csv; leave one in the folder",
+        ),
+        (
+            lambda folder: [write_lines(folder / f"{name}.csv", ["tag,forward,left", "1,0,0"]) for name in "ab"],
+            r"has 2 tables of places of tags beside uwb\.csv: a\.csv, b\.csv; leave one in the folder",
+        ),
     ],
 )  # fmt: skip
 def test_a_table_that_is_missing_or_wrong_is_one_line(
