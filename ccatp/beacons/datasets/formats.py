@@ -234,7 +234,7 @@ def _landmarks(folder: Path, warnings: list[str]) -> Table | None:
 
 
 # The readme of the set calls the columns right wheel, left wheel and distance between the wheels. The data show that
-# they are left wheel, right wheel and half that distance (see ``_wheel_columns``).
+# they are left wheel, right wheel and half that distance.
 LABYRINTH = {
     "range2": ("time [s]", "range [m]", "sigma [m]", "anchor x [m]", "anchor y [m]", "anchor", "(signal)"),
     "odom2diff": (

@@ -26,9 +26,9 @@ MOST_SETS = 50  # backward steps that are looked at, the largest first
 def ordered(tables: Mapping[str, Table], warnings: list[str]) -> dict[str, Table]:
     """Tables by kind of event, each sorted by time, of one clock, without doubled rows.
 
-    A clock that was set back or forward divides the recording into parts; the one with the longest odometry is kept.
-    Motions of equal times are added up; of equal times of truth, poses or speeds the last row counts. Rows must be
-    finite, except for motions that are unknown.
+    A clock that was set divides the recording into parts, of which one is kept: if it was set back, the one with the
+    longest time of odometry; if forward, the one with most rows of it. Motions of equal times are added up; of equal
+    times of truth, poses or speeds the last row counts. Rows must be finite, except for motions that are unknown.
     """
     found = dict(tables)
     motion = next((kind for kind in MOTIONS if kind in found), "")
@@ -142,7 +142,7 @@ def _parts(sets: list[int], count: int) -> list[slice]:
 
 
 def _without_jumps(odometry: Table, warnings: list[str]) -> Table:
-    """The longest part of the odometry without a pause of an hour, which is a clock that was set forward."""
+    """The part with most rows of the odometry without a pause of an hour, which is a clock that was set forward."""
     t = odometry.values[:, 0]
     with np.errstate(all="ignore"):
         pauses_s = np.diff(t)
