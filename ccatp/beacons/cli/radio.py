@@ -135,12 +135,17 @@ def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:
 
     from ccatp.beacons.estimation.track_review import tum_lines
 
-    paths = {file: (track.times_s, track.poses)}
-    if run.truth is not None:
-        truth = np.column_stack([run.truth.x_m, run.truth.y_m, np.nan_to_num(run.truth.heading_rad)])
-        paths[file.with_stem(f"{file.stem}_truth")] = run.truth.times_s, truth
+    antenna_m, paths = run.antenna_m, {file: (track.times_s, track.poses)}
+    if (truth := run.truth) is not None:
+        truth_file = file.with_stem(f"{file.stem}_truth")
+        headings = np.nan_to_num(truth.heading_rad)
+        paths[truth_file] = truth.times_s, np.column_stack([truth.x_m, truth.y_m, headings])
+        if not np.isfinite(truth.heading_rad).all():
+            whose = f", and {file.name} and it are of the antenna" if any(antenna_m) else ""
+            common.warn([f"{truth_file.name}: the truth has no headings: they are written as 0{whose}"])
+            antenna_m = (0.0, 0.0)
     for one, (times_s, poses) in paths.items():
-        one.write_text("\n".join(tum_lines(times_s, poses, run.antenna_m)) + "\n", encoding="utf-8")
+        one.write_text("\n".join(tum_lines(times_s, poses, antenna_m)) + "\n", encoding="utf-8")
 
 
 _flag = partial(common.key_option, is_flag=True, flag_value=True, default=None)

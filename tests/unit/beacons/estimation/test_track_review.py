@@ -1,6 +1,7 @@
 """What else a track says: residuals by beacon, the file for evo, the range that lessens the map's error most."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -9,10 +10,11 @@ import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.estimation.causal import filter_run
+from ccatp.beacons.estimation.recording import antenna_path
 from ccatp.beacons.estimation.track_review import next_range, range_residuals, residuals_by_beacon
 from ccatp.beacons.rigid_motion import rigid_modes
 from ccatp.cli import main
-from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, recorded, world, write_lines
+from tests.unit.beacons.datasets.sets import BEACONS, World, csv_lines, recorded, world, write_lines
 
 
 def test_residuals_are_the_noise_of_the_ranges() -> None:
@@ -51,20 +53,54 @@ def test_the_next_range_is_the_one_that_an_update_makes_best_of() -> None:
     assert next_range(points[:2], P[:4, :4], ends[:1], ways[:1], np.ones(1)) is None
 
 
-def test_evo_finds_the_error_of_the_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("evo", reason="evo is not installed")
+def evo_rmse_m(truth_file: Path, path_file: Path) -> float:
+    """The error that evo finds after its alignment."""
     from evo.core import metrics, sync
     from evo.tools import file_interface
 
-    file, out = write_lines(tmp_path / "mine.csv", csv_lines(world(seconds=30.0))), tmp_path / "path.tum"
-    assert main(["radio", "slam", str(file), "--json", "--tum", str(out)]) == 0
-    data = json.loads(capsys.readouterr().out)
-    assert data["measure_next"]["after_m"] < data["measure_next"]["map_m"]
-    truth, path = map(file_interface.read_tum_trajectory_file, (tmp_path / "path_truth.tum", out))
+    truth, path = map(file_interface.read_tum_trajectory_file, (truth_file, path_file))
     truth, path = sync.associate_trajectories(truth, path, max_diff=0.06)
     path.align(truth)
     error = metrics.APE(metrics.PoseRelation.translation_part)
     error.process_data((truth, path))
-    rmse_m = error.get_statistic(metrics.StatisticsType.rmse)
+    return float(error.get_statistic(metrics.StatisticsType.rmse))
+
+
+def test_evo_finds_the_error_of_the_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("evo", reason="evo is not installed")
+    file, out = write_lines(tmp_path / "mine.csv", csv_lines(world(seconds=30.0))), tmp_path / "path.tum"
+    assert main(["radio", "slam", str(file), "--json", "--tum", str(out)]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["measure_next"]["after_m"] < data["measure_next"]["map_m"]
     # evo takes the nearest pose of the truth, up to half an interval of 0.1 s and 2.5 cm away.
-    assert rmse_m == pytest.approx(data["trajectory_rmse_m"], abs=0.02)
+    assert evo_rmse_m(tmp_path / "path_truth.tum", out) == pytest.approx(data["trajectory_rmse_m"], abs=0.02)
+
+
+def with_antenna(w: World, antenna_m: tuple[float, float], *, headings: bool) -> list[str]:
+    """The run with its radio at a lever arm; a truth without headings is that of the radio."""
+    read = np.column_stack([np.interp(w.read_s, w.times_s, w.poses[:, k]) for k in range(3)])
+    ranges_m = np.hypot(*(np.array([*BEACONS.values()])[w.read_beacon] - antenna_path(read, antenna_m)).T)
+    lines = [line for line in csv_lines(replace(w, range_m=ranges_m)) if not line.startswith(("truth", "bearing"))]
+    places = w.poses if headings else antenna_path(w.poses, antenna_m)
+    truth = [f"truth,{t}," + ",".join(map(str, at)) for t, at in zip(w.times_s.tolist(), places.tolist(), strict=True)]
+    return [*lines, "antenna,{},{}".format(*antenna_m), *truth]
+
+
+@pytest.mark.parametrize("headings", [True, False])
+def test_evo_finds_the_error_of_the_path_of_an_antenna(
+    headings: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without headings nobody knows where the vehicle was: both files are of the antenna, and one line says so."""
+    pytest.importorskip("evo", reason="evo is not installed")
+    w, out, antenna_m = world(seconds=60.0), tmp_path / "path.tum", (0.9, -0.4)
+    file = write_lines(tmp_path / "mine.csv", with_antenna(w, antenna_m, headings=headings))
+    assert main(["radio", "slam", str(file), "--json", "--tum", str(out)]) == 0
+    said = capsys.readouterr()
+    data = json.loads(said.out)
+    assert data["trajectory_rmse_m"] < 0.1
+    assert evo_rmse_m(tmp_path / "path_truth.tum", out) == pytest.approx(data["trajectory_rmse_m"], abs=0.02)
+    what = "path_truth.tum: the truth has no headings: they are written as 0, and path.tum and it are of the antenna"
+    assert (what in said.err) == (not headings)
+    truth = np.loadtxt(tmp_path / "path_truth.tum")
+    wanted = w.poses[:, :2] if headings else antenna_path(w.poses, antenna_m)
+    assert truth[:, 1:3] == pytest.approx(wanted, abs=1e-6)
