@@ -76,7 +76,9 @@ def _checked(recording: Recording, turns_heading: bool, known: Known) -> Recorde
     if not len(readings.times_s):
         raise RadioDataError(file, f"none of its readings can be used ({'; '.join(warnings[-3:])})")
     if ahead_m or left_m:
-        steps, truth, first_pose = at_antenna(steps, truth, first_pose, (ahead_m, left_m), warnings)
+        steps, truth, first_pose = at_antenna(
+            steps, truth, first_pose, (ahead_m, left_m), warnings, is_given=known.first_pose is not None
+        )
     run = RecordedRun(
         recording.name, recording.kind, steps, readings, beacon_ids, places_m, truth, first_pose, (),
         (ahead_m, left_m), known_map,

@@ -234,12 +234,13 @@ def pose_of_truth(truth: ReferencePath | None, steps: Steps, warnings: list[str]
 
 def at_antenna(
     steps: Steps, truth: ReferencePath | None, first_pose: tuple[float, float, float], antenna_m: tuple[float, float],
-    warnings: list[str],
+    warnings: list[str], *, is_given: bool = False,
 ) -> tuple[Steps, ReferencePath | None, tuple[float, float, float]]:  # fmt: skip
     """The run as the path of an antenna, mounted ahead and to the left of the odometry's reference point.
 
     A turn w about that point moves the antenna across its lever arm by 2 sin(w / 2) times the arm, in the frame at the
-    middle of the turn.
+    middle of the turn. Positions of a truth without headings are the antenna's, so the first pose comes from them and
+    the path of the antenna, unless it ``is_given``.
     """
     ahead_m, left_m = antenna_m
     swing = 2.0 * np.sin(0.5 * steps.turn_rad)
@@ -251,5 +252,6 @@ def at_antenna(
         truth = truth._replace(x_m=moved[:, 0], y_m=moved[:, 1])
     elif truth is not None:
         warnings.append("the truth has no headings: its positions are taken as the antenna's")
-        x_m, y_m, _ = first_pose
+        if not is_given:
+            x_m, y_m, heading_rad = pose_of_truth(truth, steps, warnings)
     return steps, truth, (x_m, y_m, heading_rad)

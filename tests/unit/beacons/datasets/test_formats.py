@@ -13,7 +13,7 @@ from ccatp.beacons.datasets.events import EVENTS
 from ccatp.beacons.datasets.reader import found_format, read_run
 from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.datasets.trajectory import LOST_RAD, bridged
-from ccatp.beacons.estimation.recording import RecordedRun, Steps, dead_reckoned
+from ccatp.beacons.estimation.recording import Known, RecordedRun, Steps, antenna_path, dead_reckoned
 from ccatp.core import FloatArray
 from ccatp.errors import ExitStatus
 from tests.unit.beacons.datasets.sets import (
@@ -494,3 +494,17 @@ def test_an_antenna_and_a_truth_without_headings(tmp_path: Path) -> None:
     assert run.truth is not None
     assert run.truth.x_m.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert run.steps.lateral_m == pytest.approx(2.0 * np.sin(0.1) * 0.5)
+
+
+def test_the_first_pose_of_an_antenna(tmp_path: Path) -> None:
+    """By --start it is that of the vehicle, by a truth without headings that of the antenna; one frame in any case."""
+    antenna_m = (0.9, -0.4)
+    (x_m, y_m), *_ = antenna_path(W.poses[:1], antenna_m).tolist()
+    lines = [line for line in csv_lines(W) if not line.startswith("truth")]
+    places = zip(W.times_s.tolist(), antenna_path(W.poses, antenna_m).tolist(), strict=True)
+    truth = [f"truth,{t},{','.join(map(str, at))}" for t, at in places]
+    file = write_lines(tmp_path / "a.csv", [*lines, *truth, "antenna,0.9,-0.4"])
+    start = Known(first_pose=(3.0, 1.0, 0.4))  # of the vehicle in ``world``
+    for known in (Known(), start):
+        run = read_run(file, None, None, known=known)
+        assert run.first_pose == pytest.approx((x_m, y_m, 0.4), abs=1e-6)
