@@ -126,7 +126,7 @@ def _known(map_file: Path | None, start: str | None) -> "Known":
     known_map = None if map_file is None else read_known_map(map_file)
     if start is None:
         return Known(known_map)
-    x_m, y_m, heading_rad = coordinates(f"--start {start}", start, "X,Y,HEADING")
+    x_m, y_m, heading_rad = coordinates(f"--start {start}", start, "X,Y,HEADING", "m, m, rad")
     return Known(known_map, (x_m, y_m, heading_rad))
 
 

@@ -75,7 +75,7 @@ def _fit_lines(name: str, fit: "PathLossFit") -> Iterator[str]:
 
 REGION = 0.9
 _CLEARLY = 6.9  # difference of the log-likelihood: ratio of 1000 to 1
-_LARGEST_M = 1e4  # of coordinates: the range of radios is smaller
+_LARGEST = 1e4  # of coordinates, m, or angles, rad: the range of radios is smaller
 _MOST_POINTS = 250_000  # of the grid: a few megabytes for each beacon
 
 
@@ -137,17 +137,17 @@ def fix(
     common.print_result(result, _fix_lines(result), json_output)
 
 
-def coordinates(option: str, text: str, wanted: str) -> list[float]:
+def coordinates(option: str, text: str, wanted: str, units: str = "metres") -> list[float]:
     """The numbers of an option, as many as ``wanted`` names. Raises UsageError: they are not."""
     try:
-        values_m = [float(part) for part in text.split(",")]
+        values = [float(part) for part in text.split(",")]
     except ValueError:
-        values_m = []
-    if len(values_m) != 1 + wanted.count(","):
-        raise click.UsageError(f"{option}: is not {wanted} in metres")
-    if not all(isfinite(value) and abs(value) <= _LARGEST_M for value in values_m):
-        raise click.UsageError(f"{option}: coordinates must be numbers within ±{_LARGEST_M:g} m")
-    return values_m
+        values = []
+    if len(values) != 1 + wanted.count(","):
+        raise click.UsageError(f"{option}: is not {wanted} in {units}")
+    if not all(isfinite(value) and abs(value) <= _LARGEST for value in values):
+        raise click.UsageError(f"{option}: must be numbers within ±{_LARGEST:g}, in {units}")
+    return values
 
 
 def _beacons(texts: Sequence[str]) -> "Places":

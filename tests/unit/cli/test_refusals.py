@@ -133,7 +133,7 @@ REFUSED = [
     (f"{FIX} --spacing nan", "must be above 0"),
     (f"{FIX} --spacing 1e-4", "more than 250000 points in a room of 6 by 6 m; give 0.012 m or more"),
     (f"{FIX} --beacon A=1,1", "A was given before"),
-    (f"{FIX} --beacon D=nan,0", "--beacon D=nan,0: coordinates must be numbers"),
+    (f"{FIX} --beacon D=nan,0", "--beacon D=nan,0: must be numbers within ±10000, in metres"),
     (f"{FIX} --beacon =1,0", "--beacon =1,0: has no name"),
     (f"{FIX} --exchange A,Z", "is not two beacons of the data, which has A, B, C"),
     (GAP, "no rule of the fuzzy controller fires"),

@@ -299,7 +299,9 @@ def test_a_known_map_localizes_the_vehicle(tmp_path: Path, capsys: pytest.Captur
     status, _, err = said(capsys, "radio", "slam", file, *options)
     assert (status, "give it with --start X,Y,HEADING" in err) == (2, True)
     status, _, err = said(capsys, "radio", "slam", file, *options, "--start", "3,1")
-    assert (status, "--start 3,1: is not X,Y,HEADING" in err) == (2, True)
+    assert (status, "--start 3,1: is not X,Y,HEADING in m, m, rad" in err) == (2, True)
+    status, _, err = said(capsys, "radio", "slam", file, *options, "--start", "3,1,1e5")
+    assert (status, "--start 3,1,1e5: must be numbers within ±10000, in m, m, rad" in err) == (2, True)
     data = reported(capsys, "slam", file, *options, "--start", "3.05,0.95,0.42", "--json")
     assert "beacons that the known map lacks are mapped: 9" in data["warnings"]
     assert not [line for line in data["warnings"] if "the first pose is the origin" in line]
