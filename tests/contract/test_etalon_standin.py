@@ -12,7 +12,7 @@ import zmq
 import zmq.asyncio
 
 from ccatp.config.models import SimEtalonConfig
-from ccatp.links.multiline import ChannelData, parse_reply
+from ccatp.links.multiline import FLAGS, ChannelData, parse_reply
 from ccatp.sim import etalon_server as etalon_standin
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck, PuckSource, TruthUnavailable, ZmqPuck
 from ccatp.sim.laser import PuckTruth
@@ -74,6 +74,16 @@ async def test_a_bad_line_is_answered_counted_and_nothing_else(line: bytes, reas
         assert await client.ask(line) == b"error_" + reason + b"\r\n"
         assert server.counts == {"bad_requests": 1}
         assert await client.ask(b"isconnected\r\n") == b"isconnected_1\r\n"
+
+
+@pytest.mark.parametrize("flag", FLAGS)
+async def test_each_of_the_ten_error_flags_reaches_the_wire(flag: str) -> None:
+    server = standin()
+    server.model.flags = {2: {flag}}
+    async with running(server) as port, peer_of(port) as client:
+        data = parse_reply((await client.ask(b"latestlengthvalid,1,2\r\n")).rstrip())
+    assert isinstance(data, ChannelData)
+    assert [record.errors for record in data.records] == [(), (flag,)]
 
 
 async def test_flags_blocked_beams_and_cold_lasers_reach_the_wire() -> None:

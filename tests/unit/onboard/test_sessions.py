@@ -54,6 +54,26 @@ def test_in_lockstep_the_silence_after_which_a_role_is_free_is_in_wall_time(rig:
     assert holder.is_closed
 
 
+NO_MESSAGE = {
+    "not valid": b'{"type":"drive","seq":9\n',
+    "unknown type": b'{"type":"wave","seq":9}\n',
+    "of the other role": b'{"type":"permit","seq":9,"ack":0,"forward":true,"reverse":true,"turn":true}\n',
+}
+
+
+@pytest.mark.parametrize("line", NO_MESSAGE.values(), ids=NO_MESSAGE)
+def test_a_line_that_is_no_message_of_its_role_does_not_keep_the_role(rig: Rig, line: bytes) -> None:
+    r = rig()
+    holder = r.client(JOIN)
+    holder.drive(0, 0)
+    for _ in range(4):
+        r.now_s += 0.25 * SILENCE_S
+        holder.send(line)
+        assert r.client(JOIN).messages[-1] == {"type": "refused", "reason": "role taken"}
+    r.now_s += 0.01
+    assert r.client(JOIN).kinds == ["hello", "joined", "1"]
+
+
 # -- lockstep ---------------------------------------------------------------------------------------------------------
 
 
