@@ -179,9 +179,10 @@ class Corner(StrEnum):
 class Cause(msgspec.Struct, frozen=True, omit_defaults=True):
     """Why something happens: a condition by its name, with its numbers; false without a name.
 
-    ``ccatp.conditions.text_of`` makes the text for people, and nothing is decided by that text. ``values``: of the
-    variable parts of the message. ``lasted_s``, ``repetition``: why the severity was raised. ``besides``: what is found
-    besides it.
+    It is kept as it was found. So a number that grows while the condition lasts is not in it, but the limit that it has
+    passed. ``ccatp.conditions.text_of`` makes the text for people, and nothing is decided by that text.
+    ``values``: of the variable parts of the message. ``lasted_s``, ``repetition``: least time or number that raised the
+    severity. ``besides``: what is found besides it.
     """
 
     condition: str = ""

@@ -291,7 +291,7 @@ def text_of(cause: Cause) -> str:
         row, text = None, cause.condition
     if row is None and cause.values:
         text += f" ({', '.join(f'{name} {value}' for name, value in cause.values.items())})"
-    text += f", for {cause.lasted_s:g} s" if cause.lasted_s else ""
+    text += f", for more than {cause.lasted_s:g} s" if cause.lasted_s else ""
     text += f", on repetition {cause.repetition}" if cause.repetition else ""
     return text if cause.besides is None else f"{text}; {text_of(cause.besides)}"
 

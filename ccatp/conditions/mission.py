@@ -28,7 +28,7 @@ STUCK_AT_EDGE = hold("stuck_at_edge", Owner.MISSION, ALONE, Group.EDGES,
     "Look at the robot. It tries again by itself as soon as a sensor is back on.",
     action=Action.WAIT, clear=Clear.AUTO, actor=Actor.OPERATOR, then="look at the robot and its edge sensors")
 
-NO_FRAME_FOR = wait("no_frame_for", Owner.MAIN, ALONE, Group.DATA, "no sensors frame for {age_s:.2f} s",
+NO_FRAME_FOR = wait("no_frame_for", Owner.MAIN, ALONE, Group.DATA, "no sensors frame for more than {limit_s:g} s",
     "The main loop receives no frames from the robot.", "Is the robot on, the network up?",
     then="switch the robot on, check the network")
 NO_VERDICT = pause("no_verdict", Owner.MAIN, ALONE, Group.DATA, "no fresh verdict from the danger loop",
@@ -41,12 +41,12 @@ FRAME_LATE = pause("frame_late", Owner.MAIN, ALONE, Group.DATA,
     "Nothing, unless it repeats: other programs, or no real-time rights (`no real time` in `log.jsonl`).",
     then="end what else is busy on this machine")
 FRAMES_OLD = pause("frames_old", Owner.MAIN, ALONE, Group.DATA,
-    "frames are {late_ms:.0f} ms old (limit {limit_ms:.0f} ms)",
+    "frames are more than {limit_ms:.0f} ms old",
     "By the robot's echo of the drives, frames or drives are delayed by this time in the network or a queue.",
     "Check the network and the load of the robot's computer.", then="check the network")
 
 UNATTENDED_FAULT = go_home("unattended_fault", Owner.MISSION, ALONE, Group.FANS,
-    "unattended fault: the battery ({charge:.0%}) lasts for little more than the way home",
+    "unattended fault: at {charge:.0%} the battery lasts for little more than the way home",
     "Held on an overhanging mirror, and no operator has reacted: it goes home by itself, once.",
     "Attend to held robots; a fault is reported every minute.", then="attend to the fault before the next survey")
 FANS_REFUSED = fault("fans_refused", Owner.MISSION, ALONE, Group.FANS, "fan command refused: {why}; set robot.fan_duty",

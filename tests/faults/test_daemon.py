@@ -5,7 +5,6 @@ import asyncio
 import inspect
 import os
 import random
-import re
 import textwrap
 import time
 from collections.abc import Iterator
@@ -236,12 +235,12 @@ async def test_frames_that_are_old_for_good_are_reported_as_that_and_are_a_fault
         await daemon.until(lambda: daemon.is_driving)
         begin(daemon.to_main, "delay", "to_client", delay_s=0.3, jitter_s=0.0)
         mission: Any = daemon.main._runner.mission
-        await daemon.until(lambda: text_of(mission.state.cause).startswith("frames are 3"))
+        await daemon.until(lambda: text_of(mission.state.cause).startswith("frames are more"))
         assert not daemon.is_driving
-        assert re.fullmatch(r"frames are 3\d\d ms old \(limit 150 ms\)", text_of(mission.state.cause))
+        assert text_of(mission.state.cause) == "frames are more than 150 ms old"
         assert not mission.state.is_faulted
         await daemon.until(lambda: mission.state.is_faulted)
-        assert text_of(mission.state.cause).endswith("(limit 150 ms), for 3 s")
+        assert text_of(mission.state.cause).endswith("150 ms old, for more than 3 s")
         assert mission.state.is_lost
         assert {(entry["level"], entry["text"]) for entry in daemon.events("operator_message")} >= {
             ("error", text_of(mission.state.cause))

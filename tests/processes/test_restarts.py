@@ -145,7 +145,7 @@ def test_a_link_that_is_open_and_dead_is_joined_again(start: Start, tmp_path: Pa
     plan.write_text(HALF_OPEN)
     run = start("--panels", "1", "--realtime", "--faults", str(plan), calibrates=True)
     assert run.wait(180.0) == 0, run.stderr
-    assert run.stderr.count("robot link lost: no sensors frame for") == 2
+    assert run.stderr.count("robot link lost: no sensors frame for more than") == 2
     assert run.stderr.count("again") >= 2
     assert run.summary["points"]["measured"] == 9
     assert run.summary["danger"]["falls"] == 0

@@ -251,7 +251,7 @@ def events(s: SurveyState, t_s: float, rng: random.Random) -> list[SurveyInput]:
             rng.choice(
                 (
                     *(Pause(OPERATOR.cause()), Resume(), Resume(), Abort(OPERATOR.cause())),
-                    *(Interrupted(NO_FRAME_FOR.cause(age_s=1.0)), Fault(FRAMES_LOST.cause())),
+                    *(Interrupted(NO_FRAME_FOR.cause(limit_s=1.0)), Fault(FRAMES_LOST.cause())),
                     Fault(FANS_REFUSED.cause(why="y"), loses_pose=True),
                     *(EstimateDiverged(FILTER_DIVERGED.cause(why="z"), t_s), TrackingGap()),
                 )

@@ -4,6 +4,7 @@ import ast
 import re
 from math import inf
 from pathlib import Path
+from string import Formatter
 
 import pytest
 from msgspec.json import decode, encode
@@ -28,7 +29,7 @@ def test_an_advice_refers_to_no_other_row(row: Condition) -> None:
 def test_the_text_of_a_cause_has_its_numbers_duration_repetition_and_what_is_found_besides() -> None:
     cause = FAN_WEAK.cause(side="left")
     assert text_of(cause) == "the left fan gets weak"
-    assert text_of(replace(cause, lasted_s=30.0)) == "the left fan gets weak, for 30 s"
+    assert text_of(replace(cause, lasted_s=30.0)) == "the left fan gets weak, for more than 30 s"
     assert text_of(replace(cause, repetition=2, besides=NO_ESTIMATE.cause())) == (
         "the left fan gets weak, on repetition 2; no estimate"
     )
@@ -41,12 +42,27 @@ def test_a_cause_of_another_version_is_shown_with_its_name_and_its_values() -> N
     assert text_of(Cause("leg_overdue", {"x_m": "far", "y_m": 1.0})) == "leg_overdue (x_m far, y_m 1.0)"
 
 
+# Numbers in a text that stays while the condition lasts: limits, and measured values of what happened once.
+LIMITS = {"limit_s", "limit_ms", "budget_s", "time_s", "least"}
+EVENTS = {"late_ms", "charge", "x_m", "y_m", "v_m_s", "omega_rad_s", "distance_m", "ratio", "ms"}
+COUNTED = {"back_offs", "measurements_failed", "laser_not_following"}  # faults: nothing is counted after them
+RENEWED = {"sensor_much_too_slow", "sensor_too_slow", "metrology_unreliable"}  # found again, with its new number
+
+
+@pytest.mark.parametrize("row", all_conditions(), ids=lambda row: row.name)
+def test_no_text_has_a_number_that_grows_while_the_condition_lasts(row: Condition) -> None:
+    parts = {name for _, name, _, _ in Formatter().parse(row.message) if name}
+    numbers = {name for name in parts - LIMITS - EVENTS if unit_of(ast.Name(name)) or name in NUMBERS}
+    assert not numbers or row.name in COUNTED | RENEWED
+
+
 def test_values_travel_as_numbers_or_text() -> None:
     cause = MEASUREMENTS_FAILED.cause(count=3, why=ValueError("no fix"), share=inf)
     assert cause.values == {"count": 3, "why": "no fix", "share": "inf"}
     assert decode(encode(cause), type=Cause) == cause
 
 
+NUMBERS = {"count", "rate", "share"}
 UNITS = {"_m_s": "m/s", "_rad_s": "rad/s", "_hz": "Hz", "_m": "m", "_rad": "rad", "_s": "s"}
 PACKAGE = Path(conditions.__file__).parents[1]
 NAMED = (ast.Name, ast.Attribute)

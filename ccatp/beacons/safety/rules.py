@@ -220,9 +220,9 @@ class BeaconSafetyRules(SafetyRules):
     def _held(self, sensors: Sensors, hold: MonitorFinding, code: EventCode) -> Verdict:
         if self._held_since_s is None:
             self._held_since_s = sensors.t
-        held_s = sensors.t - self._held_since_s
-        if held_s > limit_s(hold.condition, self._danger):
-            cause = replace(hold.cause, lasted_s=float(round(held_s)))
+        patience_s = limit_s(hold.condition, self._danger)
+        if sensors.t - self._held_since_s > patience_s:
+            cause = replace(hold.cause, lasted_s=patience_s)
             hold = hold._replace(severity=hold.condition.raised_severity, cause=cause)
         return hold.verdict(sensors.seq, sensors.t, code)
 

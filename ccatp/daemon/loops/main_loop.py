@@ -213,9 +213,10 @@ class MainLoop:
         """Nothing but the report."""
 
     def on_silence(self, age_s: float) -> None:
-        if age_s <= self.session.cfg.sensors_timeout_s:
+        limit_s = self.session.cfg.sensors_timeout_s
+        if age_s <= limit_s:
             return
-        if self._pauses.interrupt(NO_FRAME_FOR, age_s=age_s):
+        if self._pauses.interrupt(NO_FRAME_FOR, limit_s=limit_s):
             self._telemetry.notify_operator("warning", text_of(self._runner.mission.state.cause))
             self._time.hold(self.clock.seq)
 
@@ -231,7 +232,7 @@ class MainLoop:
         status, verdict = self._runner.status(), self.peer.verdict
         lateness, link = self.loop.lateness, self.session.link
         status.elapsed_s = round(self.clock.elapsed_s, 6)
-        status.since_s = self._runner.since_s
+        status.since_s = self._runner.since_s - self._unseen_s
         if verdict is not None:
             status.code = int(verdict.code)
             status.severity = int(verdict.severity)
@@ -250,6 +251,13 @@ class MainLoop:
         )
         status.summary_state = str(mission.state.summary_state)
         return status
+
+    @property
+    def _unseen_s(self) -> float:
+        """How long no frame has shown the robot's clock, s; in lockstep it waits for the answers of this loop."""
+        age_s = self.heartbeat.frame_age_s
+        is_missing = age_s is not None and age_s > self.session.cfg.sensors_timeout_s and not self.is_lockstep
+        return age_s if age_s is not None and is_missing else 0.0
 
     # -- what the mission and the operators need of this loop --------------------------------------------------------
 

@@ -151,8 +151,9 @@ class RobotLoop:
                 continue
             age_s = now_s - frame_s
             self._work.on_silence(age_s)
-            if age_s > self.session.cfg.silence_timeout_s:
-                self.session.drop(f"no sensors frame for {age_s:.2f} s")
+            limit_s = self.session.cfg.silence_timeout_s
+            if age_s > limit_s:
+                self.session.drop(f"no sensors frame for more than {limit_s:g} s")
 
     def _on_bad_line(self) -> None:
         self._lockstep.on_bad_line(time.monotonic())

@@ -110,12 +110,15 @@ class AlarmList:
         now_s = time.monotonic()
         self._since = {name: self._since.get(name, (t_s, now_s)) for name in active}
         for name, (severity, texts) in active.items():
+            cause = "; ".join(texts)
             robot_s, our_s = self._since[name]
             if severity < LASTING and max(t_s - robot_s, now_s - our_s) < LEAST_S:
                 continue
             alarm, word = self._alarms.get(name), cast(SeverityName, severity.name.lower())
             if alarm is None or alarm.ended or Severity[alarm.severity.upper()] < severity:
-                self._happened("raised", name, t_s, word, cause="; ".join(texts))
+                self._happened("raised", name, t_s, word, cause=cause)
+            elif alarm.severity == word:  # the newest text, without an event: a number in it has changed
+                self._alarms[name] = msgspec.structs.replace(alarm, cause=cause)
         for alarm in list(self._alarms.values()):
             if not alarm.ended and alarm.name not in active:
                 self._happened("ended", alarm.name, t_s, alarm.severity, cause=alarm.cause)

@@ -18,7 +18,7 @@ from structlog.testing import capture_logs
 
 from ccatp.conditions import danger as conditions
 from ccatp.conditions import text_of
-from ccatp.conditions.mission import OPERATOR
+from ccatp.conditions.mission import METROLOGY_UNRELIABLE, OPERATOR
 from ccatp.config.models import AlarmsConfig
 from ccatp.core import Cause, EmergencyKind, Severity
 from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
@@ -159,6 +159,14 @@ def test_a_folder_that_is_gone_ends_nothing(tmp_path: Path) -> None:
     known = make(tmp_path / "gone")
     update(known, [(FAN, NONE)], 1.0)
     assert shown(known) == [("fan_weak", "return")]
+
+
+def test_the_text_of_an_alarm_has_the_newest_number(known: AlarmList) -> None:
+    for count in (3, 4, 5):
+        update(known, [(METROLOGY_UNRELIABLE.cause(count=count, channels="2"), NONE)], 10.0 + count)
+    (alarm,) = known.alarms
+    assert alarm.cause.startswith("the lengths of 5 points in a row")
+    assert (alarm.count, alarm.since_s) == (1, 14.0)  # what is not grave must last for a second
 
 
 async def test_all_that_danger_finds_is_listed_not_only_the_gravest() -> None:

@@ -201,8 +201,8 @@ def test_the_time_counts_neither_in_lockstep_nor_for_a_cause_that_does_not_escal
 def test_another_cause_of_the_main_loop_replaces_the_one_of_a_pause_and_no_other(rig: Rig) -> None:
     pauses = pause_watch(rig)
     assert pauses.interrupt(FRAME_LATE, late_ms=200.0, limit_ms=100.0)
-    assert pauses.interrupt(NO_FRAME_FOR, age_s=0.3)
+    assert pauses.interrupt(NO_FRAME_FOR, limit_s=0.3)
     assert rig.mission.state.cause.condition == NO_FRAME_FOR.name
     rig.mission.enter(Paused(), OPERATOR.cause())
-    assert not pauses.interrupt(NO_FRAME_FOR, age_s=0.3)
+    assert not pauses.interrupt(NO_FRAME_FOR, limit_s=0.3)
     assert rig.mission.state.cause.condition == OPERATOR.name

@@ -13,6 +13,7 @@ import pytest
 import zmq
 
 from ccatp.beacons.modes import BeaconMode
+from ccatp.conditions import text_of
 from ccatp.config.load import load_config
 from ccatp.core import NO_CAUSE
 from ccatp.daemon.loops.main_loop import MainLoop
@@ -23,7 +24,7 @@ from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import MissionStatus
 from ccatp.survey.engagement import Engagement, Kind, Phase
-from ccatp.survey.events import Mode, waits_for
+from ccatp.survey.events import Interrupted, Mode, waits_for
 
 
 @contextmanager
@@ -112,3 +113,21 @@ def test_a_robot_that_stands_with_nothing_wrong_says_what_it_waits_for(
 def test_the_first_row_of_the_status_says_whose_turn_it_is(loop: MainLoop) -> None:
     shown = status_rows(msgspec.to_builtins(loop.status()))
     assert shown[0] == ("now", "about to continue. Next: the robot continues by itself")
+
+
+def test_no_number_stands_still_while_frames_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s, begun_s = 1000.0, 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    runner = standing(Mode.HELD, [])
+    met: list[Interrupted] = []
+    runner.mission.handle = met.append
+    with main_loop(tmp_path, runner) as loop:
+        loop.heartbeat.frame_s = begun_s
+        lasted = []
+        for age_s in (0.16, 4.0):
+            now_s = begun_s + age_s
+            loop.on_silence(age_s)
+            status = msgspec.structs.replace(loop.status(), cause=text_of(met[-1].cause))
+            lasted.append(dict(status_rows(msgspec.to_builtins(status)))["for"])
+    assert [text_of(one.cause) for one in met] == ["no sensors frame for more than 0.15 s"] * 2
+    assert lasted == ["0:00", "0:04"]

@@ -181,7 +181,7 @@ def diverged(s: State) -> State:
 WORK: tuple[Callable[[State], State], ...] = found, left_open, ended, arrived, doubted, stuck, diverged
 INPUTS: tuple[SurveyInput, ...] = (
     *(Pause(OPERATOR.cause()), Resume(), Abort(OPERATOR.cause()), StopHere()),
-    *(Interrupted(NO_FRAME_FOR.cause(age_s=1.0)), Fault(FRAMES_LOST.cause()), Fault(FRAMES_LOST.cause(), True)),
+    *(Interrupted(NO_FRAME_FOR.cause(limit_s=1.0)), Fault(FRAMES_LOST.cause()), Fault(FRAMES_LOST.cause(), True)),
 )
 
 # -- verdicts ----------------------------------------------------------------------------------------------------------

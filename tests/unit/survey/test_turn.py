@@ -84,8 +84,8 @@ def test_in_every_state_one_acts_and_only_what_would_be_accepted_is_offered() ->
         (Engagement(Faulted(), cause=BLOCKED), PERSISTS, (),
          "held by a fault: the left wheel is blocked. Next: an operator: look for an obstacle at the wheel; resume is "
          "refused until this has ended"),
-        (Engagement(Held(), cause=NO_FRAME_FOR.cause(age_s=0.3)), None, (),
-         "held: no sensors frame for 0.30 s. Next: the robot continues by itself when this has ended"),
+        (Engagement(Held(), cause=NO_FRAME_FOR.cause(limit_s=0.15)), None, (),
+         "held: no sensors frame for more than 0.15 s. Next: the robot continues by itself when this has ended"),
         (Engagement(Held(), cause=ENCODERS_STALE.cause()), None, (),
          "held: encoder samples stale. Next: the robot takes a fix when this has ended, then continues by itself"),
         (Engagement(Held(), cause=LIFTED.cause()), None, (),
