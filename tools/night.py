@@ -157,7 +157,7 @@ def spend(night: Night) -> None:
         status = run.wait(300.0)
         night.note(f"the robot is at base, the daemon ended with {status}")
     with night.session(BATTERY.format(battery_s=35.0), "--resume", "--start-held") as run:
-        run.until(lambda status: status["turn"]["next"] == "clear")
+        run.until(lambda status: "clear" in status["turn"]["offers"])
         night.note_status()
         ccatp("clear", found["id"], "--runtime-dir", night.sockets)
         night.note("the wind is gone: cleared")

@@ -133,7 +133,7 @@ DISK_STALLS = fault("disk_stalls", Owner.FIXES, ALONE, Group.STORAGE,
     "The disk does not answer.", "Check the disk; then `ccatp resume`.", then="check the disk")
 
 RESTARTED = fault("restarted", Owner.OPERATOR, ALONE, Group.OBSERVATORY,
-    "{before}restarted: {done} points are measured and will be skipped, {left} are to do; 'ccatp resume' {goes_on}",
+    "restarted: {done} points are measured and will be skipped, {left} are to do; 'ccatp resume' {goes_on}",
     "A run was started again and waits for an operator.", "`ccatp resume` continues it.", then="look at the robot")
 OPERATOR = go_home("operator", Owner.OPERATOR, ALONE, Group.OBSERVATORY, "operator",
     "An operator called the robot home, or paused it: then it is held.",

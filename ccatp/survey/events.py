@@ -118,6 +118,12 @@ class EmergencyKnown(NamedTuple):
     """An emergency that the first verdict reports is not new."""
 
 
+class EmergencyLatched(NamedTuple):
+    """An emergency is latched, as the first verdict will say: until it is cleared, ``Resume`` is refused."""
+
+    is_shaking: bool  # an earthquake
+
+
 class TakenOver(NamedTuple):
     """Continue with the state of an earlier process, before the first frame; the robot relocalizes before it moves.
 
@@ -152,5 +158,5 @@ class FixFailed(NamedTuple):
 
 SurveyInput = (
     Pause | Resume | Abort | StopHere | Interrupted | Fault | EstimateDiverged | TrackingGap | EmergencyKnown
-    | TakenOver | FixStored | PointMissed | FixFailed
+    | EmergencyLatched | TakenOver | FixStored | PointMissed | FixFailed
 )  # fmt: skip

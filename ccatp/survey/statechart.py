@@ -24,9 +24,10 @@ from ccatp.survey.behaviours import (
     Settling,
 )
 from ccatp.survey.budget import BudgetProgress, TimeBudget
-from ccatp.survey.engagement import EngagedMission, EngagementRules, Event, Faulted, Kind, Paused, Ready, enter
+from ccatp.survey.engagement import Earthquake, EngagedMission, EngagementRules, Event, Faulted, Kind, Paused, Ready, enter
 from ccatp.survey.events import (
     EmergencyKnown,
+    EmergencyLatched,
     EstimateDiverged,
     FixFailed,
     FixStored,
@@ -424,6 +425,8 @@ class Survey(EngagementRules[SurveyState]):
                 s = self.lose_pose(s, doubts_odometry=False)
             case EmergencyKnown():
                 s = replace(s, emergency_epoch=None)
+            case EmergencyLatched(is_shaking):
+                s = replace(s, is_latched=True, earthquake=Earthquake.LATCHED if is_shaking else Earthquake.NONE)
             case TakenOver():
                 s = self._take_over(s, event)
             case FixStored():

@@ -61,8 +61,8 @@ class Next(StrEnum):
     NOTHING = "nothing"
 
 
-def offers_of(mission: EngagedMission[Any]) -> tuple[str, ...]:
-    """The requests that would be accepted now, and that would change something."""
+def offers_of(mission: EngagedMission[Any], verdict: Verdict | None) -> tuple[str, ...]:
+    """The requests that would be accepted now, and that would change something; ``verdict``: the newest one."""
     s, made = mission.state, []
     if s.kind is Kind.OVER:
         return ()
@@ -72,7 +72,8 @@ def offers_of(mission: EngagedMission[Any]) -> tuple[str, ...]:
         is_needed = name is not OperatorCommand.RESUME or s.is_held_by_hand
         if after is not None and is_needed and (after.phase != s.phase or after.abort_cause != s.abort_cause):
             made.append(str(name))
-    if s.is_latched and str(s.mode) in AT_BASE_OR_HELD:
+    # The danger loop clears only what main has reported to it as held, so not before its first verdict.
+    if verdict is not None and s.is_latched and str(s.mode) in AT_BASE_OR_HELD:
         made.append(CLEAR)
     return tuple(made)
 

@@ -4,8 +4,8 @@ from collections.abc import Collection, Sequence
 
 from ccatp.conditions.mission import RESTARTED
 from ccatp.config.models import Config
-from ccatp.core import Cause, PointId
-from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE, active_ids
+from ccatp.core import Cause, EmergencyKind, PointId
+from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE, latched_kinds
 from ccatp.daemon.supervision.process import ProcessArgs
 from ccatp.daemon.supervision.run_dir import read_run_id
 from ccatp.errors import CcatpError, ExitStatus
@@ -13,7 +13,7 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.records.checkpoint import AT_BASE, CHECKPOINT_FILE, CheckpointError, read_checkpoint
 from ccatp.records.store import MissionStore, StoreError, planned_point
 from ccatp.survey.composition import Checkpoint, SurveyParts, assemble, take_over
-from ccatp.survey.events import EmergencyKnown, Pause, SurveyOutcome, TakenOver
+from ccatp.survey.events import EmergencyKnown, EmergencyLatched, Pause, SurveyOutcome, TakenOver
 from ccatp.survey.planning.route import ORDERS
 
 
@@ -45,23 +45,19 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
     else:
         parts = take_over(cfg, checkpoint, TakenOver(measured, is_new_run=True))
     if args.is_held and not parts.mission.state.is_held_by_hand:
-        before = ""
         # A robot at base is not sent there again: it stands until the emergency is cleared and an operator resumes.
         if checkpoint is None or checkpoint.state.outcome is SurveyOutcome.AT_BASE:
             parts.mission.handle(EmergencyKnown())
-            latched = [f"'ccatp clear {one}'" for one in active_ids(args.run_dir / EMERGENCIES_FILE)]
-            if latched:
-                before = f"the last run ended with an emergency: {', '.join(latched)} when its cause is gone; "
-        parts.mission.handle(Pause(_why_held(before, points, measured, skipped)))
+        parts.mission.handle(Pause(_why_held(points, measured, skipped)))
+    if latched := latched_kinds(args.run_dir / EMERGENCIES_FILE):
+        parts.mission.handle(EmergencyLatched(EmergencyKind.EARTHQUAKE in latched))
     return parts, store
 
 
-def _why_held(
-    before: str, points: Sequence[PointId], measured: Collection[PointId], skipped: Collection[PointId]
-) -> Cause:
+def _why_held(points: Sequence[PointId], measured: Collection[PointId], skipped: Collection[PointId]) -> Cause:
     left = [point for point in points if point not in measured and point not in skipped]
     goes_on = f"continues with point {left[0].row}-{left[0].col}-{left[0].point}" if left else "ends it"
-    return RESTARTED.cause(before=before, done=len(measured), left=len(left), goes_on=goes_on)
+    return RESTARTED.cause(done=len(measured), left=len(left), goes_on=goes_on)
 
 
 def _open_store(cfg: Config, args: ProcessArgs, mirror: str, points: Sequence[PointId]) -> MissionStore:

@@ -17,12 +17,19 @@ EMERGENCIES_FILE = "emergencies.json"
 RESERVE_BYTES = 65536
 
 
-def active_ids(path: Path) -> list[str]:
-    """The ids of the active emergencies in a file; empty if it cannot be read."""
+def read_active(path: Path) -> list[Emergency]:
+    """The active emergencies in a file. Raises OSError, ValueError, KeyError or TypeError: it cannot be read."""
+    return [Emergency(EmergencyKind(e["kind"]), str(e["id"]), e["note"]) for e in json.loads(read_text(path))["active"]]
+
+
+def latched_kinds(path: Path) -> set[EmergencyKind]:
+    """The kinds of the active emergencies in a file; one that cannot be read is taken for an emergency, as below."""
     try:
-        return [str(e["id"]) for e in json.loads(read_text(path))["active"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
+        return {one.kind for one in read_active(path)}
+    except FileNotFoundError:
+        return set()
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        return {EmergencyKind.OPERATOR}
 
 
 class PersistentEmergencyLatch(EmergencyLatch):
@@ -39,7 +46,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
             self._reserve()
         try:
             kept = json.loads(read_text(path))
-            self._active = {e["id"]: Emergency(EmergencyKind(e["kind"]), e["id"], e["note"]) for e in kept["active"]}
+            self._active = {one.id: one for one in read_active(path)}
             self._cleared = dict.fromkeys(map(str, kept["cleared"]))
             self.raised = int(kept.get("raised", len(self._active) + len(self._cleared)))
         except FileNotFoundError:

@@ -195,7 +195,7 @@ class MainLoop:
         self._standstill.update(now_s, is_withheld=self._time.withheld is not None)
 
     def _update_alarms(self) -> None:
-        self._alarms.update(self._runner.causes, self.clock.t_s)
+        self._alarms.update(self._runner.causes, self.peer.verdict, self.clock.t_s)
 
     def is_frame_due(self) -> bool:
         return self._time.withheld is None
@@ -246,9 +246,8 @@ class MainLoop:
         status.alarms = self._alarms.alarms.alarms
         status.stopped_by = self._stopped_by
         mission = self._runner.mission
-        status.turn = turn_of(
-            mission.state, verdict, offers_of(mission), self._runner.wait_cause, resumes=self._resumes
-        )
+        offers = offers_of(mission, verdict)
+        status.turn = turn_of(mission.state, verdict, offers, self._runner.wait_cause, resumes=self._resumes)
         status.summary_state = str(mission.state.summary_state)
         return status
 

@@ -36,6 +36,14 @@ def utc_now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
+class _Activity(NamedTuple):
+    """When an alarm became active, by the robot's and the host's clock, and how many texts it had at most since."""
+
+    robot_s: float
+    host_s: float
+    texts: int
+
+
 class ActiveCause(NamedTuple):
     """An active cause: name of its condition, the text for operators, and its severity."""
 
@@ -54,7 +62,10 @@ EventName = Literal["raised", "ended", "acknowledged"]
 
 
 class AlarmEvent(msgspec.Struct, frozen=True):
-    """An event of an alarm, UTC and robot time: ``raised`` (also to a higher severity), ``ended``, ``acknowledged``."""
+    """An event of an alarm, UTC and robot time: ``raised``, ``ended``, ``acknowledged``.
+
+    ``raised`` also to a higher severity, or once more beside what is active, as a second emergency.
+    """
 
     utc: str
     t_s: float
@@ -89,7 +100,7 @@ class AlarmList:
         self._log = log
         self._now = now
         self._alarms: dict[str, Alarm] = {}
-        self._since: dict[str, tuple[float, float]] = {}  # start of the active ones by the robot's and the host's clock
+        self._active: dict[str, _Activity] = {}
         self._lines = 0
         for event in read_history(run_dir):
             self._lines += 1
@@ -108,16 +119,20 @@ class AlarmList:
                 known, texts = active.get(name, (Severity.INFORM, []))
                 active[name] = max(known, severity), texts if cause in texts else [*texts, cause]
         now_s = time.monotonic()
-        self._since = {name: self._since.get(name, (t_s, now_s)) for name in active}
+        before, self._active = self._active, {}
         for name, (severity, texts) in active.items():
             cause = "; ".join(texts)
-            robot_s, our_s = self._since[name]
-            if severity < LASTING and max(t_s - robot_s, now_s - our_s) < LEAST_S:
+            since = before.get(name, _Activity(t_s, now_s, len(texts)))
+            self._active[name] = since._replace(texts=max(since.texts, len(texts)))
+            if severity < LASTING and max(t_s - since.robot_s, now_s - since.host_s) < LEAST_S:
                 continue
             alarm, word = self._alarms.get(name), cast(SeverityName, severity.name.lower())
-            if alarm is None or alarm.ended or Severity[alarm.severity.upper()] < severity:
+            is_more = alarm is None or alarm.ended or Severity[alarm.severity.upper()] < severity
+            if is_more or len(texts) > since.texts:
                 self._happened("raised", name, t_s, word, cause=cause)
-            elif alarm.severity == word:  # the newest text, without an event: a number in it has changed
+            elif (
+                alarm is not None and alarm.severity == word
+            ):  # the newest text, without an event: a number in it has changed
                 self._alarms[name] = msgspec.structs.replace(alarm, cause=cause)
         for alarm in list(self._alarms.values()):
             if not alarm.ended and alarm.name not in active:
@@ -164,12 +179,11 @@ class AlarmList:
                 since=event.utc,
                 since_s=event.t_s,
             )
-            if known is not None and known.ended:
-                alarm.count = known.count + 1
-            elif known is not None:  # its severity was raised
-                alarm.since = known.since
-                alarm.since_s = known.since_s
-                alarm.count = known.count
+            if known is not None:
+                is_graver = not known.ended and known.severity != event.severity
+                alarm.count = known.count if is_graver else known.count + 1
+                if not known.ended:
+                    alarm.since, alarm.since_s = known.since, known.since_s
         elif known is None:
             return
         elif event.event == "acknowledged":

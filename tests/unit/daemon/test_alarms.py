@@ -5,6 +5,7 @@ import threading
 import time
 import uuid
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from uuid import UUID
 import msgspec
 import pytest
 import structlog
+import zmq
 from msgspec.structs import replace
 from structlog.testing import capture_logs
 
@@ -20,8 +22,15 @@ from ccatp.conditions import danger as conditions
 from ccatp.conditions import text_of
 from ccatp.conditions.mission import METROLOGY_UNRELIABLE, OPERATOR
 from ccatp.config.models import AlarmsConfig
-from ccatp.core import Cause, EmergencyKind, Severity
-from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
+from ccatp.core import Cause, EmergencyKind, Severity, Verdict
+from ccatp.daemon.loops.alarm_watch import AlarmWatch
+from ccatp.daemon.loops.emergency_file import (
+    EMERGENCIES_FILE,
+    RESERVE_BYTES,
+    PersistentEmergencyLatch,
+    latched_kinds,
+    read_active,
+)
 from ccatp.daemon.operator import alarms, webhook
 from ccatp.daemon.operator.alarms import LEAST_S, ActiveCause, AlarmList, active_cause, read_history
 from ccatp.daemon.operator.webhook import AlarmWebhook, changes
@@ -126,6 +135,33 @@ def test_a_grave_alarm_stays_until_it_is_acknowledged(known: AlarmList) -> None:
     assert known.acknowledge("wings", "anna", 51.0) == "no alarm 'wings'; the list has fan_weak"
 
 
+def test_a_second_emergency_is_a_second_event_of_one_entry(tmp_path: Path, known: AlarmList) -> None:
+    update(known, [(FIRE, NONE), (FIRE, NONE)], 10.0)  # of danger and of the mission that it sends home
+    known.acknowledge("emergency", "anna", 11.0)
+    before = {one.name: one for one in known.alarms}
+    update(known, [(FIRE, NONE), (WEATHER, NONE)], 12.0)
+    (alarm,) = known.alarms
+    assert (alarm.cause, alarm.count, alarm.acknowledged_by) == ("emergency: fire; emergency: weather", 2, "")
+    assert (alarm.since_s, [what for what, _ in changes(before, {alarm.name: alarm})]) == (10.0, ["raised"])
+    for causes in ([FIRE], [FIRE, WEATHER], []):  # one is cleared, and comes again
+        update(known, [(cause, NONE) for cause in causes], 13.0)
+    assert [one.event for one in read_history(tmp_path)] == ["raised", "acknowledged", "raised", "ended"]
+
+
+def test_an_emergency_that_outlasts_a_process_is_one_event(tmp_path: Path, known: AlarmList) -> None:
+    update(known, [(FIRE, NONE)], 10.0)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    verdict = Verdict.normal(1, 0.01)
+    with closing(AlarmWatch(context, f"ipc://{tmp_path}/danger", make(tmp_path))) as watch:
+        watch.update([], None, 0.0)
+        watch.update([], replace(verdict, raised=1), 0.0)  # danger reports changes; there was none
+        assert shown(watch.alarms) == [("emergency", "return")]
+        watch.update([], verdict, 0.0)
+        assert shown(watch.alarms) == [("emergency", "return ended")]
+    context.destroy(linger=0)
+    assert [one.event for one in read_history(tmp_path)] == ["raised", "ended"]
+
+
 def test_one_that_becomes_graver_is_to_be_acknowledged_again(known: AlarmList) -> None:
     update(known, [(STALE, Severity.HOLD)], 10.0)
     known.acknowledge("edge_stale", "anna", 11.0)
@@ -208,7 +244,7 @@ def test_an_emergency_is_there_after_a_restart_until_it_is_cleared(tmp_path: Pat
     again = PersistentEmergencyLatch(path, log)
     assert again.newest == latch.newest
     assert again.raised == 2
-    assert active_ids(path) == ["a"]
+    assert [one.id for one in read_active(path)] == ["a"]
     assert again.raise_emergency("power", "b") is None  # cleared is cleared
     assert again.newest == latch.newest
     assert again.clear("a", at_base_or_held=True) is None
@@ -220,6 +256,7 @@ def test_a_file_that_cannot_be_read_counts_as_an_emergency(
     tmp_path: Path, log: Log, reported: StringIO, text: str
 ) -> None:
     (tmp_path / EMERGENCIES_FILE).write_text(text)
+    assert latched_kinds(tmp_path / EMERGENCIES_FILE) == {EmergencyKind.OPERATOR}
     latch = PersistentEmergencyLatch(tmp_path / EMERGENCIES_FILE, log)
     assert latch.is_latched
     newest = latch.newest

@@ -25,6 +25,7 @@ from ccatp.daemon.supervision.process import Endpoints, ProcessArgs
 from ccatp.daemon.supervision.run_dir import keep_origin
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello, RobotData
+from ccatp.links.topics import MissionStatus
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.checkpoint import CHECKPOINT_FILE, CheckpointError, CheckpointFile, read_checkpoint
@@ -40,6 +41,7 @@ from ccatp.survey.events import (
     FixStored,
     Mode,
     Pause,
+    Resume,
     StopHere,
     SurveyOutcome,
     TakenOver,
@@ -48,6 +50,7 @@ from ccatp.survey.planning.route import Route
 from ccatp.survey.points import Failure, PointLog
 from ccatp.survey.state import OnRoute, SurveyPhase, SurveyState
 from ccatp.survey.statechart import Mission
+from ccatp.survey.turn import offers_of, turn_of, turn_text
 from tests.faults.linking import Measured
 from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
@@ -332,8 +335,11 @@ def test_a_robot_that_an_emergency_sent_to_its_base_stands_there_until_it_is_cle
     at_base = outcome is SurveyOutcome.AT_BASE
     assert state.is_held_by_hand
     assert (state.emergency_epoch is None) == at_base
-    expected = "the last run ended with an emergency: 'ccatp clear of-fire' when its cause is gone; "
-    assert text_of(state.cause).startswith(expected) == at_base
+    # Before the first verdict, which will say the same, resume is refused and not offered.
+    assert again.mission.handle(Resume()) == "an emergency of before is latched: 'ccatp clear' it first"
+    status = MissionStatus(seq=-1, t_s=0.0, state="held", turn=turn_of(state, None, offers_of(again.mission, None)))
+    assert turn_text(status).line.endswith("Next: the observatory: clear the emergency; then resume")
+    assert (turn_text(status).request, text_of(state.cause)[:10]) == ("", "restarted:")
 
 
 @pytest.mark.fault("P24")

@@ -48,7 +48,8 @@ def test_in_every_state_one_acts_and_only_what_would_be_accepted_is_offered() ->
     assert {s.kind for s in states} == set(Kind)
     for s in states:
         mission = EngagedMission(RULES, s)
-        offers = offers_of(mission)
+        offers = offers_of(mission, Verdict.normal(1, 0.01))
+        assert set(offers) - set(offers_of(mission, None)) <= {CLEAR}  # danger knows nothing of the state yet
         is_resumed = RULES.handle(s, Resume())[1] is None
         assert ("resume" in offers) is (s.is_held_by_hand and is_resumed)
         assert ("pause" in offers) is (s.kind not in (Kind.PAUSED, Kind.FAULTED, Kind.OVER))
@@ -182,9 +183,9 @@ def test_actor_is_who_acts_while_the_condition_holds_the_robot(row: Condition, m
 
 def test_an_action_of_an_operator_is_offered_with_the_name_of_the_request() -> None:
     mission = EngagedMission(RULES, RULES.handle(State(Task(stands=False)), Pause(CALLED))[0])
-    assert offers_of(mission) == ("resume", "abort", "stop")
+    assert offers_of(mission, None) == ("resume", "abort", "stop")
     s = mission.state
-    text = turn_text(status_of(s, turn_of(s, None, offers_of(mission))))
+    text = turn_text(status_of(s, turn_of(s, None, offers_of(mission, None))))
     assert text.request == "resume"
 
 
