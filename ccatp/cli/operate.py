@@ -6,7 +6,7 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -166,14 +166,33 @@ def alarms(
         if any(context.get_parameter_source(name) is ParameterSource.COMMANDLINE for name in context.params):
             raise click.UsageError(f"options go behind the command, as in ccatp alarms {command} --runtime-dir DIR")
         return
-    found = _ask(common.configured_folder(config_file, runtime_dir), "status", timeout_s)["status"]["alarms"]
-    lines = [line for alarm in found for line in _alarm_lines(alarm)]
+    folder = common.configured_folder(config_file, runtime_dir)
+    found = _ask(folder, "status", timeout_s)["status"]["alarms"]
+    latched = _latched(folder)
+    lines = [line for alarm in found for line in _alarm_lines(alarm, latched)]
     common.print_result(
-        {"alarms": found}, lines or ["no alarms; ccatp status shows what the robot waits for"], json_output
+        {"alarms": found, "emergencies": latched},
+        lines or ["no alarms; ccatp status shows what the robot waits for"],
+        json_output,
     )
 
 
-def _alarm_lines(alarm: Mapping[str, Any]) -> list[str]:
+def _latched(folder: Path | None) -> list[dict[str, str]]:
+    """The latched emergencies of the running daemon: alarm, kind, id, note; none if their file cannot be read."""
+    from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE, read_active
+    from ccatp.daemon.supervision.process import run_dir_in
+    from ccatp.links.runtime_dir import runtime_dir_path
+    from ccatp.safety.emergency_latch import cause_of
+
+    run_dir = run_dir_in(runtime_dir_path(str(folder or ""), os.environ))
+    try:
+        active = [] if run_dir is None else read_active(run_dir / EMERGENCIES_FILE)
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        return []
+    return [{"alarm": cause_of(e.kind).condition, "kind": str(e.kind), "id": e.id, "note": e.note} for e in active]
+
+
+def _alarm_lines(alarm: Mapping[str, Any], latched: Sequence[Mapping[str, str]]) -> list[str]:
     times = f", {alarm['count']} times" if alarm["count"] > 1 else ""
     ended = f", ended {alarm['ended']}" if alarm["ended"] else ""
     seen = f", acknowledged by {alarm['acknowledged_by']} {alarm['acknowledged']}" if alarm["acknowledged"] else ""
@@ -181,6 +200,11 @@ def _alarm_lines(alarm: Mapping[str, Any]) -> list[str]:
         f"{alarm['severity']:<7} {alarm['name']}: {alarm['cause']}",
         f"        since {alarm['since']}{times}{ended}{seen}",
         *([f"        {alarm['advice']}"] if alarm["advice"] else []),
+        *(
+            f"        {one['kind']}{': ' if one['note'] else ''}{one['note']}; ended by 'ccatp clear {one['id']}'"
+            for one in latched
+            if one["alarm"] == alarm["name"] and not alarm["ended"]
+        ),
     ]
 
 

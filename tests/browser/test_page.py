@@ -392,7 +392,12 @@ async def test_an_emergency_is_reported_and_cleared_after_a_confirmation(operato
     await operator.until("document.querySelectorAll('#emergencies button').length", 1)
     await page.locator("#emergencies button").click()
     await page.locator("#clear button[value='']").click()
-    await page.locator("#emergencies button").click()
+    # With its alarm it is one entry.
+    operator.status = {**operator.status, "alarms": [alarm("emergency", "return")]}
+    await operator.until("document.querySelectorAll('#emergencies li').length", 0)
+    await operator.until("document.querySelectorAll('#alarms li').length", 1)
+    await operator.until_text("#alarms .emergency", "fire: smoke Clear …")
+    await page.locator("#alarms .emergency button").click()
     await page.locator("#clear-confirm").click()
     await operator.until_text("#answer", "clear: done")
     assert operator.rig.asked[1:] == [{"cmd": "clear", "id": latched["active"][0]["id"]}]

@@ -11,6 +11,7 @@ import msgspec
 
 import ccatp
 from ccatp.conditions import danger_text, text_of
+from ccatp.conditions.danger import EARTHQUAKE, EMERGENCY
 from ccatp.conditions.mission import OPERATOR
 from ccatp.core import EmergencyKind, Verdict
 from ccatp.links import topics
@@ -137,6 +138,11 @@ class Links:
         is_well = frame_s is not None and loss is None and not is_main_lost
         phase = "frames" if is_well else "no frame yet" if frame_s is None else "lost"
         return LinkState("robot", phase, _age_s(frame_s, now_s), is_well), loss
+
+
+def _alarm_of(kind: object) -> str:
+    """The name of the alarm about an emergency of a kind."""
+    return EARTHQUAKE.name if kind == EmergencyKind.EARTHQUAKE else EMERGENCY.name
 
 
 def _age_s(since_s: float | None, now_s: float) -> float | None:
@@ -337,7 +343,7 @@ class RunStateView:
             "sensors_age_s": self.links.sensors_age_s(now_s),
             "utc_s": time.time(),
             "started": self._files.started,
-            "emergencies": self._files.emergencies,
+            "emergencies": [{**one, "alarm": _alarm_of(one.get("kind"))} for one in self._files.emergencies],
             "messages_left_out": self._lines.left_out,
             "alarms": [] if mission is None else mission.pop("alarms"),
         }

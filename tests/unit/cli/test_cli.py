@@ -18,6 +18,8 @@ from ccatp.cli import cli, main
 from ccatp.cli.common import configured_folder, parse_setting, working
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
+from ccatp.daemon.loops.emergency_file import EMERGENCIES_FILE
+from ccatp.daemon.supervision.process import RUN_DIR_FILE
 from ccatp.daemon.supervision.run_dir import RunOptions
 from ccatp.errors import ConfigError, DaemonUnreachableError, RefusedError
 from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
@@ -173,7 +175,7 @@ def test_alarms_are_shown_acknowledged_and_kept(
             "        since A, 2 times, ended B, acknowledged by anna C",
             "        Replace it.",
         ]
-        assert answered(capsys, "alarms") == {"alarms": [ALARM]}
+        assert answered(capsys, "alarms") == {"alarms": [ALARM], "emergencies": []}
         assert printed(capsys, "alarms", "ack", "fan_weak") == "ok\n"
         assert asked[-1] == {"cmd": "acknowledge", "name": "fan_weak", "by": getpass.getuser()}
     assert main(["alarms", "--json", "ack", "x"]) == 2
@@ -185,6 +187,27 @@ def test_alarms_are_shown_acknowledged_and_kept(
     assert printed(capsys, "alarms", "history", tmp_path) == "A  acknowledged by anna: return fan_weak: weak\n"
     assert answered(capsys, "alarms", "history", tmp_path) == {"history": [json.loads(line)]}
     assert "no such run; name its directory" in refused(capsys, "alarms", "history", tmp_path / "none")
+
+
+def test_an_emergency_is_one_entry_of_the_alarms_with_the_command_that_ends_it(
+    runtime_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("CCATP_RUNTIME_DIR", str(runtime_dir))
+    (runtime_dir / RUN_DIR_FILE).write_text(f"{tmp_path}\n")
+    note = {"kind": "weather", "id": "7", "note": "wind 25 m/s"}
+    (tmp_path / EMERGENCIES_FILE).write_text(json.dumps({"active": [note], "cleared": []}))
+    alarm = {**ALARM, "name": "emergency", "cause": "emergency: weather", "count": 1, "ended": "", "acknowledged": ""}
+    status = {"seq": 1, "t_s": 1.0, "state": "held", "alarms": [alarm]}
+    with serving(runtime_dir, "control", lambda _: {"ok": True, "status": status}):
+        assert printed(capsys, "alarms").splitlines() == [
+            "return  emergency: emergency: weather",
+            "        since A",
+            "        Replace it.",
+            "        weather: wind 25 m/s; ended by 'ccatp clear 7'",
+        ]
+        assert answered(capsys, "alarms")["emergencies"] == [{"alarm": "emergency", **note}]
+        (tmp_path / EMERGENCIES_FILE).write_text("{")
+        assert answered(capsys, "alarms")["emergencies"] == []
 
 
 def test_an_answer_may_be_shown_as_json_or_be_empty(

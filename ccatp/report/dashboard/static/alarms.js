@@ -82,21 +82,27 @@ export class Alarms {
     if ($("alarms-head").textContent !== title) $("alarms-head").textContent = title;
     this.announce(alarms, isAll);
     $("alarms-card").hidden = alarms.length + emergencies.length === 0;
-    fill($("emergencies"), emergencies.map((emergency) => ({ ...emergency, canClear })), (emergency) => {
+    // An emergency is shown in its alarm; without one, as after the end of a daemon, it has a row of its own.
+    const shown = emergencies.map((emergency) => ({ ...emergency, canClear }));
+    const of = (alarm) => (alarm.ended ? [] : shown.filter((emergency) => emergency.alarm === alarm.name));
+    const listed = new Set(alarms.flatMap(of));
+    fill($("emergencies"), shown.filter((emergency) => !listed.has(emergency)), (emergency) => {
       const row = node("li", "");
       row.dataset.level = "bad";
       const head = node("span", "");
       head.append(node("b", "■ emergency"), node("strong", `${emergency.kind}${emergency.note ? `: ${emergency.note}` : ""}`));
       row.title = emergency.id;
-      row.append(head);
-      if (canClear) {
-        const button = node("button", "Clear …");
-        button.onclick = () => this.askToClear(emergency);
-        row.append(button);
-      }
+      row.append(head, ...this.clearButton(emergency));
       return row;
     });
-    fill($("alarms"), alarms.map((alarm) => ({ ...alarm, isOver: is_over })), (alarm) => this.row(alarm));
+    fill($("alarms"), alarms.map((alarm) => ({ ...alarm, isOver: is_over, emergencies: of(alarm) })), (alarm) => this.row(alarm));
+  }
+
+  clearButton(emergency) {
+    if (!emergency.canClear) return [];
+    const button = node("button", "Clear …");
+    button.onclick = () => this.askToClear(emergency);
+    return [button];
   }
 
   row(alarm) {
@@ -110,6 +116,12 @@ export class Alarms {
     const ended = alarm.ended ? `, ended ${time(alarm.ended)}` : "";
     head.append(node("small", ` since ${time(alarm.since)}${times}${ended}${by}`));
     row.append(head, node("p", alarm.advice));
+    for (const emergency of alarm.emergencies) {
+      const line = node("p", `${emergency.kind}${emergency.note ? `: ${emergency.note}` : ""} `, "emergency");
+      line.title = emergency.id;
+      line.append(...this.clearButton(emergency));
+      row.append(line);
+    }
     if (!alarm.acknowledged_by && !alarm.isOver) {
       const button = node("button", "Acknowledge", "acknowledge");
       button.onclick = () => this.commands.acknowledge(alarm.name);

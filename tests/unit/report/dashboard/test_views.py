@@ -303,7 +303,8 @@ def test_messages_and_emergencies_are_those_of_the_run_directory(tmp_path: Path)
     (tmp_path / "emergencies.json").write_text('{"active": [{"kind": "fire", "id": "7", "note": ""}], "cleared": []}')
     view.read_files()
     state = reported(view)
-    assert (state["started"], state["emergencies"]) == (begun["timestamp"], [{"kind": "fire", "id": "7", "note": ""}])
+    fire = {"kind": "fire", "id": "7", "note": "", "alarm": "emergency"}
+    assert (state["started"], state["emergencies"]) == (begun["timestamp"], [fire])
     assert state["log"] == [
         ["2026-11-26T03:32:00.5Z", "error", "a line", 1, 1],
         ["2026-11-26T03:33:00Z", "warning", "danger: edge (front left): 0.006 (limit 0.005)", 1, 2],
