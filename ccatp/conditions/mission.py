@@ -56,7 +56,7 @@ FANS_REFUSED = fault("fans_refused", Owner.MISSION, ALONE, Group.FANS, "fan comm
 LINK_LOST = wait("link_lost", Owner.LINK, ALONE, Group.LINK, "robot link lost: {reason}",
     "The connection ended. The robot holds its wheels by itself; main reconnects for `robot.reconnect_timeout_s`. "
     "A robot that rebooted, or may have moved meanwhile, is relocalized.",
-    "Check network and robot. After that time the run ends with status 5; `--resume` continues it.",
+    "Check network and robot. After `robot.reconnect_timeout_s` the run ends with status 5.",
     clear=Clear.AUTO, then="switch the robot on, check the network")
 FRAMES_BACKWARD = diverged("frames_backward", Owner.LOCALIZER, ALONE, Group.LINK,
     "time stamps of the frames run backward",
@@ -137,6 +137,6 @@ RESTARTED = fault("restarted", Owner.OPERATOR, ALONE, Group.OBSERVATORY,
     "A run was started again and waits for an operator.", "`ccatp resume` continues it.", then="look at the robot")
 OPERATOR = go_home("operator", Owner.OPERATOR, ALONE, Group.OBSERVATORY, "operator",
     "An operator called the robot home, or paused it: then it is held.",
-    "`ccatp resume` after a pause; otherwise nothing, a new survey measures the remaining points.", action=Action.ABORT,
+    "`ccatp resume` after a pause; otherwise nothing: the run ends at the base.", action=Action.ABORT,
     actor=Actor.OPERATOR)
 # fmt: on

@@ -11,7 +11,7 @@ from msgspec.json import decode, encode
 from msgspec.structs import replace
 
 from ccatp import conditions
-from ccatp.conditions import Condition, all_conditions, text_of
+from ccatp.conditions import Condition, Owner, all_conditions, text_of
 from ccatp.conditions.danger import FAN_WEAK, NO_ESTIMATE
 from ccatp.conditions.mission import MEASUREMENTS_FAILED
 from ccatp.core import NO_CAUSE, Cause
@@ -47,6 +47,20 @@ LIMITS = {"limit_s", "limit_ms", "budget_s", "time_s", "least"}
 EVENTS = {"late_ms", "charge", "x_m", "y_m", "v_m_s", "omega_rad_s", "distance_m", "ratio", "ms"}
 COUNTED = {"back_offs", "measurements_failed", "laser_not_following"}  # faults: nothing is counted after them
 RENEWED = {"sensor_much_too_slow", "sensor_too_slow", "metrology_unreliable"}  # found again, with its new number
+
+
+# What robots of every kind of mission meet: of the main loop, the link and the observatory, and in the safety rules.
+OF_EVERY_MISSION = {"operator", "emergency", "earthquake", "no_frame", "encoders_stale"}
+OF_A_SURVEY = re.compile(r"\b(survey|points?|panels?|mirror|laser|puck|rim)\b|--resume")
+
+
+@pytest.mark.parametrize(
+    "row",
+    [row for row in all_conditions() if row.owner in (Owner.MAIN, Owner.LINK) or row.name in OF_EVERY_MISSION],
+    ids=lambda row: row.name,
+)
+def test_an_advice_for_every_mission_does_not_speak_of_a_survey(row: Condition) -> None:
+    assert not OF_A_SURVEY.search(f"{row.advice} {row.then}")
 
 
 @pytest.mark.parametrize("row", all_conditions(), ids=lambda row: row.name)
