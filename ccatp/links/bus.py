@@ -6,7 +6,6 @@ In lockstep a loop waits for the message of its frame. The main loop publishes l
 import os
 import time
 from collections.abc import Callable, Iterable
-from functools import cache
 from typing import Any
 
 import msgspec
@@ -15,6 +14,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from ccatp.core import Verdict
+from ccatp.links.bus_codec import BadMessage, pack, prefix_of, unpack
 from ccatp.links.topics import (
     LEVELS,
     OPERATOR_MESSAGE,
@@ -25,7 +25,6 @@ from ccatp.links.topics import (
     SensorLines,
     SessionMessage,
     Timing,
-    find_topic,
     last_estimate_before,
 )
 
@@ -34,41 +33,6 @@ MAX_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 50_000
 # A subscriber may start before its publisher, and should then connect soon.
 RECONNECT_MS = 10
-_encode = msgspec.json.Encoder().encode
-_decoders: dict[bytes, tuple[str, msgspec.json.Decoder[Any]]] = {}  # of the topics received so far
-
-
-def _decoder(prefix: bytes) -> tuple[str, msgspec.json.Decoder[Any]] | None:
-    """Name and decoder of a topic; ``None``: there is none of that name."""
-    topic = find_topic(prefix.decode("ascii", "replace"))
-    if topic is not None:
-        _decoders[prefix] = topic.name, msgspec.json.Decoder[Any](topic.message)
-    return _decoders.get(prefix)
-
-
-@cache
-def _prefix(name: str) -> bytes:
-    if find_topic(name) is None:
-        raise KeyError(name)
-    return name.encode() + b" "
-
-
-class BadMessage(Exception):
-    """A frame on the bus that is no message of a known topic."""
-
-
-def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
-    """The topic's name, JSON text and message of a frame; raises ``BadMessage``."""
-    prefix, _, body = frame.partition(b" ")
-    known = _decoders.get(prefix) or _decoder(prefix)
-    if known is None:
-        raise BadMessage(f"unknown topic {prefix[:40]!r}")
-    name, decoder = known
-    try:
-        message: Message | Verdict = decoder.decode(body)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise BadMessage(f"topic {name}: {error}") from error
-    return name, body, message
 
 
 class Publisher:
@@ -83,7 +47,7 @@ class Publisher:
 
     def send(self, name: str, message: Message | Verdict) -> None:
         """Publish one message: topic, space, JSON."""
-        self._socket.send(_prefix(name) + _encode(message), zmq.DONTWAIT)
+        self._socket.send(pack(name, message), zmq.DONTWAIT)
 
     def has_subscriber(self, name: str) -> bool:
         """Whether a subscriber of a topic is connected; what was published before, it does not receive."""
@@ -131,7 +95,7 @@ class Subscriber:
             self.socket.setsockopt(zmq.CONFLATE, 1)
         for name in topics:
             # Every message is an object, so a prefix with a brace matches, too, but is not the one of `has_subscriber`.
-            self.socket.setsockopt(zmq.SUBSCRIBE, _prefix(name) + (b"{" if is_uncounted else b""))
+            self.socket.setsockopt(zmq.SUBSCRIBE, prefix_of(name) + (b"{" if is_uncounted else b""))
         for endpoint in endpoints:
             self.socket.connect(endpoint)
         self._timeout_s = -1.0

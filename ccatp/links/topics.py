@@ -1,4 +1,4 @@
-"""The topic table: all messages of the processes over ZeroMQ; ``ccatp.links.bus`` is its codec.
+"""The topic table: all messages of the processes over ZeroMQ; ``ccatp.links.bus_codec`` is its codec.
 
 Liveness, recording and displays use the table; a new topic needs one row. Levels are repeated at their rate.
 """

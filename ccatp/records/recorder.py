@@ -27,7 +27,7 @@ from zstandard import ZstdError
 
 from ccatp.core import Verdict
 from ccatp.links import topics
-from ccatp.links.bus import unpack
+from ccatp.links.bus_codec import unpack
 from ccatp.links.runtime_dir import RUN_LOCK, is_held
 
 TELEMETRY = "telemetry.mcap"

@@ -18,7 +18,7 @@ from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray, IntArray, Measured, PanelId, PointId, Vector3
 from ccatp.errors import UsageError
 from ccatp.links import topics
-from ccatp.links.bus import BadMessage
+from ccatp.links.bus_codec import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, deck_rows

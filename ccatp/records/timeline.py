@@ -21,7 +21,7 @@ import numpy as np
 
 from ccatp.core import FloatArray, IntArray, Verdict
 from ccatp.links import topics
-from ccatp.links.bus import BadMessage
+from ccatp.links.bus_codec import BadMessage
 from ccatp.records.recorder import decode_recorded, iter_logged
 
 # A step of the clock differs from the period of the frames by more than this, s, and by more than twice the greatest

@@ -16,7 +16,7 @@ from ccatp.config.files import read_text
 from ccatp.config.load import kind_in, load_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, Measured, PanelId, Vector3
-from ccatp.links.bus import BadMessage
+from ccatp.links.bus_codec import BadMessage
 from ccatp.links.topics import ArrivalMessage, FixMessage, MissionStatus
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.surface import MirrorError

@@ -20,7 +20,7 @@ from rosbags.typesys.stores import ros2_jazzy as ros
 from ccatp.config.models import Config
 from ccatp.core import Corner, DeckPose, FloatArray, PanelId, PanelPose, Severity
 from ccatp.kinematics import twist_of
-from ccatp.links.bus import BadMessage
+from ccatp.links.bus_codec import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import DangerEvent, FixMessage, MissionStatus, SensorLines, TrackMessage, TruthMessage

@@ -16,7 +16,7 @@ from ccatp.errors import ConfigError
 from ccatp.links import channels, multiline, topics
 from ccatp.links import robot_codec as robot
 from ccatp.links.auth import read_clients
-from ccatp.links.bus import BadMessage, unpack
+from ccatp.links.bus_codec import BadMessage, unpack
 from ccatp.links.robot_codec import LineBuffer, LineTooLong
 from ccatp.links.robot_messages import Sensors
 from ccatp.safety.emergency_latch import answer_observatory

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import msgspec
 
 from ccatp.conditions import danger_text
-from ccatp.links.bus import BadMessage
+from ccatp.links.bus_codec import BadMessage
 from ccatp.links.liveness import kind_of
 from ccatp.links.topics import OPERATOR_MESSAGE, Message
 from ccatp.records.recorder import decode_recorded, iter_messages

@@ -8,7 +8,8 @@ import pytest
 import zmq
 
 from ccatp.core import Cause, EventCode, Verdict
-from ccatp.links.bus import BadMessage, Publisher, Subscriber, unpack
+from ccatp.links.bus import Publisher, Subscriber
+from ccatp.links.bus_codec import BadMessage, unpack
 from ccatp.links.topics import (
     ESTIMATE_FRAMES,
     EstimateMessage,
