@@ -22,10 +22,10 @@ from ccatp.report.html import render
 from ccatp.rest import WHEEL_STANDS_RAD_S
 from ccatp.sensing.sample_times import possible_gravity
 from ccatp.survey.checks import MirrorCheck
-from ccatp.survey.composition import plan_survey, robot_problems
+from ccatp.survey.composition import robot_problems
 from ccatp.survey.forecast import clock, forecast_time
 from ccatp.survey.planning.legs import PlanError
-from ccatp.survey.planning.route import ORDERS
+from ccatp.survey.planning.route import ORDERS, plan_survey
 
 
 class CheckOutcome(StrEnum):

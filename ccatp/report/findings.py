@@ -23,11 +23,10 @@ from ccatp.records.summary import arrival_error_m, distribution, measured_error_
 from ccatp.records.timeline import common_rows, row_before, rows_of
 from ccatp.report.network import remarks
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, SurveyFiles
-from ccatp.survey.composition import plan_survey
 from ccatp.survey.ending import ending_of, read_ending, why_text
 from ccatp.survey.fix_gate import nis_of
 from ccatp.survey.planning.legs import PlanError
-from ccatp.survey.planning.route import ORDERS
+from ccatp.survey.planning.route import ORDERS, plan_survey
 from ccatp.survey.planning.search import leg_lengths, leg_time, stop_times
 
 SIGMAS = 3.0

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from math import ceil, cos, sin
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,7 +22,9 @@ from ccatp.report import plots
 from ccatp.report.findings import Grade, PointVerdict, point_verdicts
 from ccatp.report.plots import BAD, INK, PANEL, PAPER, PATH, PX_PER_IN, QUIET, SEAM, PictureError, add_legend, is_wide
 from ccatp.report.record import WITHIN_MM, SurveyFiles, read_record
-from ccatp.survey.survey_plan import SurveyPlan
+
+if TYPE_CHECKING:
+    from ccatp.survey.survey_plan import SurveyPlan
 
 MAP_WIDTH_PX, MAP_DPI = 1600, 160
 ALIGN_WIDTH_PX, ALIGN_DPI = 2400, 200
@@ -194,7 +196,7 @@ def record_map(record: SurveyFiles, width_px: float) -> Figure:
     return run_map(record.mirror, driven_path_m(record), verdicts, width_px, title, subtitle)
 
 
-def draw_plan(mirror: Mirror, plan: SurveyPlan, out: Path) -> None:
+def draw_plan(mirror: Mirror, plan: "SurveyPlan", out: Path) -> None:
     """Draw the route of a planned survey, coloured by the planned time. Raises PictureError: it cannot be drawn."""
     width_px = MAP_WIDTH_PX * PX_PER_IN / MAP_DPI
     title = f"{mirror.name}: {len(plan.points) - len(plan.out_of_reach)} of {len(plan.points)} points"

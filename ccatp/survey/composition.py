@@ -1,6 +1,6 @@
-"""Assembles the parts of a main loop from a configuration and a checkpoint; plans the route of a survey."""
+"""Assembles the parts of a main loop from a configuration and a checkpoint."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import hypot
 
@@ -20,7 +20,7 @@ from ccatp.localizer import Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.rest import ALMOST_AT_REST_M_S, ALMOST_AT_REST_RAD_S
 from ccatp.survey.events import HELD, IDLE, MEASURING, SETTLING, Mode, TakenOver
-from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner
+from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner, plan_survey
 from ccatp.survey.planning.search import path_time
 from ccatp.survey.state import SurveyState
 from ccatp.survey.statechart import Mission, Survey
@@ -192,26 +192,6 @@ def take_over(cfg: Config, checkpoint: Checkpoint, event: TakenOver) -> SurveyPa
     parts = assemble(cfg, (*event.measured, *failed), checkpoint)
     parts.mission.handle(event)
     return parts
-
-
-def plan_survey(
-    cfg: Config,
-    mirror: Mirror,
-    points: Sequence[PointId],
-    done: Collection[PointId] = (),
-    out_of_reach: list[PointId] | None = None,
-    *,
-    calibrates: bool = True,
-) -> Route:
-    """The route of a survey from base, with the calibration drive first if the localizer uses one.
-
-    Points that cannot be reached are added to ``out_of_reach``; without this list they raise ``PlanError``, as does a
-    base that is not on the mirror.
-    """
-    planner = RoutePlanner(mirror, cfg)
-    route = planner.route(mirror.base_pose, points, done, out_of_reach)
-    # The four-state localizer has no parameters to calibrate.
-    return planner.with_calibration(route) if calibrates and cfg.run.filter not in FOUR_STATE else route
 
 
 def robot_problems(cfg: Config, mirror: Mirror, hello: Hello) -> list[str]:

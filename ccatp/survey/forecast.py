@@ -4,8 +4,7 @@ from typing import NamedTuple
 
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.composition import plan_survey
-from ccatp.survey.planning.route import ORDERS, Route
+from ccatp.survey.planning.route import ORDERS, Route, plan_survey
 from ccatp.survey.planning.search import path_time
 
 # What a stop adds to the least time, s: settling, and delays and slip on the turn and the leg before it. From twenty

@@ -9,9 +9,9 @@ from ccatp.config.models import Config
 from ccatp.control.grip_model import GripForecast, GripModel
 from ccatp.core import PointId, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.composition import plan_survey, slowed
+from ccatp.survey.composition import slowed
 from ccatp.survey.forecast import TimeForecast, clock, forecast_time
-from ccatp.survey.planning.route import ORDERS
+from ccatp.survey.planning.route import ORDERS, plan_survey
 from ccatp.survey.planning.search import leg_lengths, leg_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
 

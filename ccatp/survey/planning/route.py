@@ -7,7 +7,7 @@ from math import ceil, hypot
 
 import numpy as np
 
-from ccatp.config.models import Config, LimitsConfig
+from ccatp.config.models import FOUR_STATE, Config, LimitsConfig
 from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
 from ccatp.kinematics import difference
 from ccatp.mirror.layout import POINTS_PER_ROW
@@ -274,3 +274,23 @@ def no_points(mirror: Mirror, panels: int = 0) -> list[PointId]:
 
 
 ORDERS: dict[str, Order] = {"thesis": thesis_order, "optimised": optimised_order, "calibration": no_points}
+
+
+def plan_survey(
+    cfg: Config,
+    mirror: Mirror,
+    points: Sequence[PointId],
+    done: Collection[PointId] = (),
+    out_of_reach: list[PointId] | None = None,
+    *,
+    calibrates: bool = True,
+) -> Route:
+    """The route of a survey from base, with the calibration drive first if the localizer uses one.
+
+    Points that cannot be reached are added to ``out_of_reach``; without this list they raise ``PlanError``, as does a
+    base that is not on the mirror.
+    """
+    planner = RoutePlanner(mirror, cfg)
+    route = planner.route(mirror.base_pose, points, done, out_of_reach)
+    # The four-state localizer has no parameters to calibrate.
+    return planner.with_calibration(route) if calibrates and cfg.run.filter not in FOUR_STATE else route

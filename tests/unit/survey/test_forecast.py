@@ -8,9 +8,8 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
 from ccatp.studies.sil_run import rehearse
-from ccatp.survey.composition import plan_survey
 from ccatp.survey.forecast import TimeForecast, forecast_time
-from ccatp.survey.planning.route import ORDERS
+from ccatp.survey.planning.route import ORDERS, plan_survey
 
 
 @cache
