@@ -24,7 +24,17 @@ from ccatp.survey.behaviours import (
     Settling,
 )
 from ccatp.survey.budget import BudgetProgress, TimeBudget
-from ccatp.survey.engagement import Earthquake, EngagedMission, EngagementRules, Event, Faulted, Kind, Paused, Ready, enter
+from ccatp.survey.engagement import (
+    Earthquake,
+    EngagedMission,
+    EngagementRules,
+    Event,
+    Faulted,
+    Kind,
+    Paused,
+    Ready,
+    enter,
+)
 from ccatp.survey.events import (
     EmergencyKnown,
     EmergencyLatched,
