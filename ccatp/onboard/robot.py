@@ -76,7 +76,7 @@ class OnboardRobot(ControlledRobot):
         self._cfg, self._hardware = cfg, hardware
         self.loop_hz = cfg.servo.loop_hz
         self._servos = WheelServo(cfg.servo), WheelServo(cfg.servo)
-        self._edges = [EdgeThreshold(cfg.edges) for _ in range(4)]
+        self._edges = [EdgeThreshold(cfg.edges) for _ in range(4)]  # in the order of the robot link
         self._rad_per_count = 2.0 * pi / cfg.servo.counts_per_rev
         self._last_counts: tuple[float, int | None, int | None] | None = None
         self._slides = SlideMonitor(
@@ -120,7 +120,7 @@ class OnboardRobot(ControlledRobot):
             self._stall = ""
         if self._stall:
             self.faults["stall"] = self._stall
-        if is_late or now_s < self._slides_until_s or any(name in self.faults for name in NEEDED):
+        if is_late or now_s < self._slides_until_s or not self.faults.keys().isdisjoint(NEEDED):
             right_set, left_set = HELD
             self.rules.is_held = True
         try:
@@ -150,11 +150,9 @@ class OnboardRobot(ControlledRobot):
         self._downhill = readings.gravity or self._downhill
         for t_s, right, left in readings.counts:
             self._count(t_s, right, left)
-        for t_s, *voltages in readings.edges:
-            front_left, front_right, rear_left, rear_right = (
-                edge.read(t_s, voltage_v) for edge, voltage_v in zip(self._edges, voltages, strict=True)
-            )
-            self._edge.append((t_s, front_left, front_right, rear_left, rear_right))
+        a, b, c, d = self._edges
+        for t_s, a_v, b_v, c_v, d_v in readings.edges:
+            self._edge.append((t_s, a.read(t_s, a_v), b.read(t_s, b_v), c.read(t_s, c_v), d.read(t_s, d_v)))
         if readings.imu and self._last_counts is not None:
             right_rad, left_rad = [None if n is None else n * self._rad_per_count for n in self._last_counts[1:]]
             if self._slides.step(readings.imu[-1], (right_rad, left_rad), self._downhill):

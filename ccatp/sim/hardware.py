@@ -10,7 +10,6 @@ the robot. The plant's first-order wheels represent this motor exactly while the
 one step for each step of the control loop. A braked motor has 0 V.
 """
 
-from collections.abc import Sequence
 from math import floor, pi
 from typing import NamedTuple
 
@@ -137,7 +136,8 @@ class SimulatedHardware:
             self._step += 1
             if self._step:
                 self._move()
-            new_edges, new_imu, _, new_gravity = self._sensors.read(self._step, self.world.plant)
+            # The encoders are read as counts, below.
+            new_edges, new_imu, _, new_gravity = self._sensors.read(self._step, self.world.plant, has_encoders=False)
             edges += new_edges
             imu += [(*row, self._sensors.read_lateral(self.world.plant, 0.0)) for row in new_imu]
             gravity = new_gravity or gravity
@@ -168,10 +168,9 @@ class SimulatedHardware:
         self._duty = (left, right)
 
 
-_PANEL_V, _NONE_V = 2.4, 0.5
+_VOLTS = 0.5, 2.4  # without and with a panel
 
 
-def _voltages(row: Sequence[float]) -> tuple[float, float, float, float, float]:
-    t_s, *bits = row
-    a, b, c, d = (_PANEL_V if bit else _NONE_V for bit in bits)
-    return t_s, a, b, c, d
+def _voltages(row: EdgeTuple) -> tuple[float, float, float, float, float]:
+    t_s, a, b, c, d = row
+    return t_s, _VOLTS[a], _VOLTS[b], _VOLTS[c], _VOLTS[d]

@@ -326,11 +326,12 @@ class SensorSuite:
         self.edges = EdgeSensors(mirror, cfg.robot.edge_sensors_m, material)
 
     def read(
-        self, frame: int, plant: Plant
+        self, frame: int, plant: Plant, *, has_encoders: bool = True
     ) -> tuple[list[EdgeTuple], list[ImuTuple], list[WheelTuple], GravityTuple | None]:
         """Edge, inertial and encoder samples of a frame, and the newest reading of gravity within it.
 
         Frames count from 1; frame 0 is the instant of boot. Call it once per frame, after the plant's step.
+        ``has_encoders``: else there is no sample of them.
         """
         at = frame - self._ahead_from
         if not 0 <= at < len(self._ahead):
@@ -340,7 +341,7 @@ class SensorSuite:
         return (
             self.edges.read(plant, edge_times.times_s, edge_times.fractions),
             self._imu.read(plant, imu_times),
-            self._encoders.read(plant, encoder_times),
+            self._encoders.read(plant, encoder_times) if has_encoders else [],
             self._read_gravity(plant, gravity_times.times_s[-1]) if gravity_times.times_s else None,
         )
 
