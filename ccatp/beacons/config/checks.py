@@ -27,6 +27,19 @@ def check_radio_config(cfg: RadioConfig, *, simulates: bool = True) -> Problems:
     yield from check_dashboard(cfg.dashboard)
 
 
+def check_mission(cfg: RadioConfig) -> Problems:
+    """What keeps a mission from its end, though maps and studies have a use for it."""
+    layout, laps = cfg.cricket.layout, cfg.mission.laps
+    if cfg.system == "cricket" and layout != "networks":
+        what = f'= "{layout}" has no plan by which the motes of a robot map themselves; give "networks"'
+        yield problem_of("cricket.layout", f"{what}, or map them with ccatp radio map")
+    if cfg.system == "cricket" and cfg.follow.is_active:
+        yield problem_of("follow.is_active", '= true needs radios; motes are not followed: give system = "follow"')
+    if not cfg.follow.is_active and not cfg.workspace.loops and laps > 1:
+        what = f"= false visits each waypoint once, but mission.laps = {laps}; give mission.laps = 1 or loops = true"
+        yield problem_of("workspace.loops", what, "mission.laps")
+
+
 def _check_fuzzy(fuzzy: FuzzyConfig) -> Problems:
     root = "control.fuzzy"
     for name, given in fuzzy.inputs.items():

@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from ccatp.beacons.config.checks import check_radio_config
+from ccatp.beacons.config.checks import check_mission, check_radio_config
 from ccatp.beacons.config.models import RadioConfig, RecordingsConfig
+from ccatp.config.checks import Problems
 from ccatp.config.load import Overrides, layers, merged, read_source, strongest, validated
 from ccatp.config.messages import Key, choice_hint, format_value
 from ccatp.config.package import configs_dir
@@ -23,13 +24,14 @@ WHOLE: tuple[Key, ...] = (
 
 
 def load_radio_config(
-    file: Path | None = None, overrides: Overrides = None, *, simulates: bool = True, any_ports: bool = False
-) -> RadioConfig:
+    file: Path | None = None, overrides: Overrides = None, *, simulates: bool = True, drives: bool = False,
+    any_ports: bool = False,
+) -> RadioConfig:  # fmt: skip
     """The whole configuration of a robot among radio beacons; arguments as in ``load_config``.
 
     ``system`` of the user's file, else of the base file ``radio.toml``, says which of ``zigbee.toml``, ``follow.toml``
     and ``cricket.toml`` lies between the two. ``simulates`` says whether a field of motes is simulated, or its ranges
-    were measured.
+    were measured; ``drives``, whether a mission is to be possible with it.
     """
     command, user, base = sources = layers(BEACON_FILE, file, overrides, any_ports=any_ports)
     run = user.tree.get("run")
@@ -48,9 +50,20 @@ def load_radio_config(
     system = read_source(configs_dir() / f"{name}.toml")
     tree = merged(merged(base.tree, system.tree, WHOLE), user.tree, WHOLE)
     sources = [command, user, system, base]
-    return validated(
-        RadioConfig, merged(tree, command.tree), sources, lambda cfg: check_radio_config(cfg, simulates=simulates)
-    )
+
+    def check(cfg: RadioConfig) -> Problems:
+        yield from check_radio_config(cfg, simulates=simulates)
+        if drives:
+            yield from check_mission(cfg)
+
+    return validated(RadioConfig, merged(tree, command.tree), sources, check)
+
+
+def load_beacon_mission(
+    file: Path | None = None, overrides: Overrides = None, *, any_ports: bool = False
+) -> RadioConfig:
+    """The configuration of a mission; as ``load_radio_config``, and a mission with it can end."""
+    return load_radio_config(file, overrides, drives=True, any_ports=any_ports)
 
 
 def load_recordings_config(file: Path | None = None, overrides: Overrides = None) -> RecordingsConfig:

@@ -237,5 +237,5 @@ STUDY = Study(
     defaults={"system": "cricket"},
     mirrors=(),
     runs=50,
-    loader=Part("ccatp.beacons.config.load:load_radio_config"),
+    loader=Part("ccatp.beacons.config.load:load_beacon_mission"),
 )

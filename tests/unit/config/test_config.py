@@ -259,6 +259,43 @@ def test_a_mistake_among_beacons_is_one_line(keys: dict[str, Any], message: str)
     assert "\n" not in str(caught.value)
 
 
+RANDOM_MOTES = {"system": "cricket", "cricket.layout": "random"}
+THREE_MOTES = {
+    "system": "cricket",
+    "cricket.layout": "motes",
+    "cricket.motes": {f"M{k}": {"place_m": [k, k * k], "facing": [1.0, 0.0]} for k in range(3)},
+}
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (RANDOM_MOTES, 'cricket.layout = "random" has no plan by which the motes of a robot map themselves'),
+        (THREE_MOTES, 'cricket.layout = "motes" has no plan'),
+        (
+            {"system": "cricket", "follow.is_active": True},
+            "follow.is_active = true needs radios; motes are not followed",
+        ),
+        (
+            {"system": "zigbee", "workspace.loops": False},
+            "workspace.loops = false visits each waypoint once, but mission.laps = 2",
+        ),
+    ],
+)
+def test_a_mission_that_could_not_end_is_refused(keys: dict[str, Any], message: str) -> None:
+    """``ccatp radio map`` and the studies of radios have a use for these values."""
+    load_radio_config(None, keys)
+    with pytest.raises(ConfigError) as caught:
+        load_mission(None, keys)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_one_lap_needs_no_loop() -> None:
+    assert not load_mission(None, {"system": "zigbee", "workspace.loops": False, "mission.laps": 1}).workspace.loops
+    assert not load_mission(None, {"system": "follow", "workspace.loops": False}).workspace.loops
+
+
 def test_files_without_a_system_or_with_one_stand_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "radio.toml", "[run]\nseed = 1\n")
     with monkeypatch.context() as elsewhere:
