@@ -178,9 +178,10 @@ class PoseBelief(NamedTuple):
 class Score(NamedTuple):
     """Consistency of all readings so far with their predictions."""
 
-    nis_sum: float
-    nis_size: int
-    refused: int
+    nis_sum: float  # of the readings that were used
+    nis_size: int  # their degrees of freedom: two of a level with a bearing
+    used: int  # readings
+    refused: int  # readings
 
 
 def ellipse_of(mean: FloatArray | Sequence[float], covariance: FloatArray) -> Ellipse:
@@ -195,13 +196,14 @@ class _DeadReckoning:
         self._cfg, self._motion = cfg, SlippingVehicle(cfg.vehicle, cfg.odometry)
         self._reckoned = np.zeros(self._motion.size)
         self._reckoned[:POSE] = cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad
-        self.score = Score(0.0, 0, 0)
+        self.score = Score(0.0, 0, 0, 0)
 
     def _count(self, nis: float, size: int, *, accepted: bool) -> None:
-        nis_sum, nis_size, refused = self.score
-        self.score = (
-            Score(nis_sum + nis, nis_size + size, refused) if accepted else Score(nis_sum, nis_size, refused + 1)
-        )
+        nis_sum, nis_size, used, refused = self.score
+        if accepted:
+            self.score = Score(nis_sum + nis, nis_size + size, used + 1, refused)
+        else:
+            self.score = Score(nis_sum, nis_size, used, refused + 1)
 
     @property
     def reckoned_m(self) -> tuple[float, float]:

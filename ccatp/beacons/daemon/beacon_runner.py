@@ -143,10 +143,7 @@ class BeaconRunner(MissionRunner):
 
     def log_statistics(self) -> None:
         """Log the consistency of the readings."""
-        score = self.mission.navigator.score
-        self.telemetry.log.info(
-            "reading_statistics", nis_sum=score.nis_sum, nis_size=score.nis_size, refused=score.refused
-        )
+        self.telemetry.log.info("reading_statistics", **self.mission.navigator.score._asdict())
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
@@ -237,6 +234,7 @@ class BeaconRunner(MissionRunner):
             nis_size=score.nis_size,
             refused=score.refused,
             notes=dict(navigator.notes),
+            used=score.used,
         )
         self.telemetry.send("beacon_map", message)
         self.telemetry.send("scene", Scene(seq=seq, t_s=t_s, shapes=self._shapes(beacons, waypoints)))

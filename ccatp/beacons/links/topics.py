@@ -31,6 +31,7 @@ class BeaconMapMessage(Message):
     nis_size: int  # their degrees of freedom
     refused: int  # readings that the gate refused
     notes: dict[str, float]  # of the mission about the map: phases, expected errors
+    used: int = 0  # readings that the gate accepted; older recordings lack it
 
 
 class BeaconArrival(Reached):

@@ -41,7 +41,8 @@ class BeaconSummary(RunRecord):
     truth: list[Sequence[float | None]] = field(default_factory=list)  # rows of the topic ``beacon_truth``
     places: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # true, of radios and motes
     beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # ellipses of the newest map, by name
-    score: tuple[float, int, int] = (0.0, 0, 0)  # of that map: sum of NIS, its degrees of freedom, readings refused
+    score: tuple[float, int] = (0.0, 0)  # of that map: sum of NIS, its degrees of freedom
+    readings: tuple[int, int] = (0, 0)  # used, refused
     notes: Mapping[str, float] = field(default_factory=dict)
     reached: list[tuple[int, Sequence[float]]] = field(default_factory=list)  # frame; x, y, xx, xy, yy by the estimate
     events: Counter[str] = field(default_factory=Counter)  # how often motion began to be denied, by the signal
@@ -61,7 +62,7 @@ class BeaconSummary(RunRecord):
             self.places = message.places
         elif isinstance(message, beacon_topics.BeaconMapMessage):
             self.beacons, self.notes = message.beacons, message.notes
-            self.score = message.nis_sum, message.nis_size, message.refused
+            self.score, self.readings = (message.nis_sum, message.nis_size), (message.used, message.refused)
         elif isinstance(message, beacon_topics.BeaconArrival):
             self.reached.append((message.seq, message.estimate))
         elif isinstance(message, topics.Timing):
@@ -105,8 +106,8 @@ class BeaconSummary(RunRecord):
             "consistency": {
                 "pose_nees_mean": rounded(np.mean(nees(errors, track.covariance))) if known else None,
                 "nis_mean": rounded(self.score[0] / self.score[1]) if self.score[1] else None,
-                "readings": self.score[1],
-                "refused": self.score[2],
+                "readings": self.readings[0],
+                "refused": self.readings[1],
             },
             "danger": dict(sorted(self.events.items())),
             "map": {name: rounded(value) for name, value in sorted(self.notes.items())},

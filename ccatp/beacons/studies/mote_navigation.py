@@ -130,7 +130,8 @@ class BeaconSilWorld:
         score = mission.navigator.score
         summary.track, summary.truth = list(found.track), list(found.truth)
         summary.places, summary.beacons = self.robot.truth_preface()[1].places, mission.navigator.beacons
-        summary.score, summary.notes = (score.nis_sum, score.nis_size, score.refused), mission.navigator.notes
+        summary.score, summary.readings = (score.nis_sum, score.nis_size), (score.used, score.refused)
+        summary.notes = mission.navigator.notes
         summary.mission_time_s, summary.outcome, summary.cause = found.times_s[-1], found.outcome, found.cause
         found.summary = summary.build(0.0)
         return found

@@ -12,7 +12,14 @@ from msgspec.structs import replace
 from ccatp.beacons.conditions import RADIO_SILENT
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.estimation.motion import Steering
-from ccatp.beacons.links.messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
+from ccatp.beacons.links.messages import (
+    BeaconFrame,
+    MoteBurst,
+    RadioSample,
+    RadioScan,
+    decode_beacon_frame,
+    with_extras,
+)
 from ccatp.beacons.mission import RULES, BeaconMission, WaypointArrival, check_beacon_robot, permitted, wheel_rates
 from ccatp.beacons.modes import VISITING, Working
 from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, PoseBelief, SelfMap, packets_of
@@ -270,14 +277,28 @@ def test_another_robot_is_refused(system: str, keys: dict[str, Any], what: str, 
 def test_a_summary_without_truth_holds_what_needs_none(cfg: RadioConfig) -> None:
     book = BeaconSummary(cfg, has_truth=False)
     navigator = BeaconMission(cfg).navigator
-    book.beacons, book.score = {"beacon1": (0.1, 0.2, 0.01, 0.0, 0.01)}, (2.0, 2, 0)
-    book.notes = navigator.notes
+    book.beacons, book.score = {"beacon1": (0.1, 0.2, 0.01, 0.0, 0.01)}, (2.0, 2)
+    book.readings, book.notes = (1, 0), navigator.notes
     summary = book.build(1.0)
     assert summary["trajectory_rmse_m"] is None
     assert summary["position_error_m"]["max"] is None
     assert summary["beacons"]["rmse_m"] is None
     assert summary["beacons"]["mapped"] == 1
     assert summary["consistency"]["nis_mean"] == 1.0
+    assert (summary["consistency"]["readings"], summary["consistency"]["refused"]) == (1, 0)
+
+
+def test_readings_are_counted_and_not_their_values(cfg: RadioConfig) -> None:
+    """A level with a bearing is one reading of two values, whether it is used or refused."""
+    navigator = BeaconMission(cfg).navigator
+    readings = [RadioSample(0.1 * k, "beacon4", -43.0, 0.785) for k in range(1, 60)]
+    wild = RadioSample(6.0, "beacon4", -100.0, -2.3)
+    for one in (*readings, wild):
+        navigator.take(BeaconMeasurements(one.t_s, (), BeaconFrame(radio=[one])))
+    score = navigator.score
+    assert 20 < score.used < len(readings)  # the first ones wait until they place the radio
+    assert score.nis_size == 2 * score.used
+    assert score.refused == 1
 
 
 def test_the_store_keeps_what_was_reached(cfg: RadioConfig, tmp_path: Path) -> None:

@@ -145,7 +145,7 @@ class BeaconView(RunStateView):
             "beacons on the map": str(len(static)),
             "error of the map, expected": expected,
             "error of the map, true": true,
-            "readings used, refused": f"{size}, {message.refused}" if size else None,
+            "readings used, refused": f"{message.used}, {message.refused}" if message.used else None,
             "mean NIS": f"{message.nis_sum / size:.2f}" if size else None,
         }
         if message.target is not None:

@@ -411,8 +411,8 @@ def test_the_map_against_what_is_expected_and_what_is_true(room: BeaconView) -> 
 
 def test_facts(room: BeaconView) -> None:
     assert reported(room)["facts"] == []
-    assert dict(reported(room, told_map(nis_sum=6.0, nis_size=4, refused=2))["facts"]) == {
-        "beacons on the map": "2", "error of the map, expected": "200.0 mm", "readings used, refused": "4, 2",
+    assert dict(reported(room, told_map(nis_sum=6.0, nis_size=4, used=3, refused=2))["facts"]) == {
+        "beacons on the map": "2", "error of the map, expected": "200.0 mm", "readings used, refused": "3, 2",
         "mean NIS": "1.50", "to the waypoint": "1.40 m", "lap": "1 of 2",
     }  # fmt: skip
 
