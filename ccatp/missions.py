@@ -55,7 +55,7 @@ class MissionKind:
     # The run: texts, what is checked before it begins, processes, summary.
     text: Part = Part("ccatp.daemon.supervision.run_text:plain_text")  # Callable[[C], RunText]
     check: Part | None = None  # Callable[[run_dir.RunOptions, C], None], raises ConfigError
-    without_effect: Part | None = None  # Callable[[C], list[str]]: a line for each key that was set and does nothing
+    without_effect: Part | None = None  # Callable[[C, bool], list[str]]: lines on keys that do nothing; bool: simulated
     resumed: Part | None = None  # Callable[[C, Path], None], raises ConfigError: the run in a folder is another one
     processes: Part = Part("ccatp.daemon.supervision.supervisor:WITHOUT_LASER")  # tuple[ProcessSpec, ...]
     record: Part = Part("ccatp.records.run_record:status_record")  # Callable[[C, Path, RobotClock, bool], RunRecord]

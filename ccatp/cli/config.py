@@ -43,7 +43,7 @@ def config_check(file: Path) -> int:
     kind = kind_of(cfg)
     text = kind.text.get()(cfg)
     if kind.without_effect is not None:
-        common.warn(f"{file}: {line}" for line in kind.without_effect.get()(cfg))
+        common.warn(f"{file}: {line}" for line in kind.without_effect.get()(cfg, True))  # likewise
     click.echo(f"{file}: ok: {text.shown}, seed {cfg.run.seed}")
     return 0
 

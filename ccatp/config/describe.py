@@ -101,7 +101,7 @@ def differences(cfg: CommonConfig, other: CommonConfig | None = None) -> list[tu
     return [(key, before.get(key), after.get(key)) for key in keys if before.get(key) != after.get(key)]
 
 
-def keys_without_effect(cfg: Config) -> list[str]:
+def keys_without_effect(cfg: Config, _is_sim: bool) -> list[str]:
     """A line for each key of a survey that differs from the default and is for another filter than ``run.filter``."""
     unused, filters = ("full_state", "ekf and ukf") if cfg.run.filter in FOUR_STATE else ("four_state", "kf")
     shipped = load_config().localizer.model_dump(mode="json")[unused]

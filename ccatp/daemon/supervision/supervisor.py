@@ -210,7 +210,7 @@ class SupervisedRun:
             from ccatp.survey.ending import ending_of  # noqa: PLC0415
 
             view = self._view
-            for line in () if kind.without_effect is None else kind.without_effect.get()(cfg):
+            for line in () if kind.without_effect is None else kind.without_effect.get()(cfg, is_sim):
                 self._notify_operator("warning", line)
             collector = Collector(context, self._context, self._on_heartbeat)
             with collector, view:

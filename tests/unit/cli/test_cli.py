@@ -323,9 +323,12 @@ def test_the_laser_system_alone_gets_its_puck(stub: Stub, tmp_path: Path) -> Non
          ["localizer.full_state.slip_mean = 0.1 has no effect with run.filter = kf; it is for ekf and ukf",
           "localizer.full_state.use.seams = false has no effect with run.filter = kf; it is for ekf and ukf"]),
         ("[localizer]\nhistory_s = 0.3\n", []),
+        ('system = "zigbee"\n[mission]\nlaps = 1\nfollow_s = 9.0\n[cricket.batch]\nuses_shapes = false\n',
+         ["mission.follow_s = 9.0 has no effect unless follow.is_active = true",
+          "cricket.batch.uses_shapes = false has no effect without motes; it is for cricket"]),
     ],
 )  # fmt: skip
-def test_keys_for_another_filter_are_reported(
+def test_keys_without_effect_are_reported(
     text: str, lines: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "telescope.toml"
