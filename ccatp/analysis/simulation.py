@@ -16,6 +16,7 @@ from ccatp.config.models import Config
 from ccatp.core import NO_CAUSE, Cause
 from ccatp.daemon.loops.mission_runner import TimedFrame
 from ccatp.daemon.operator.alarms import LASTING, LEAST_S, active_cause
+from ccatp.errors import ExitStatus
 from ccatp.links.robot_codec import decode_from_robot, encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import ArrivalMessage, MissionStatus
@@ -42,10 +43,8 @@ def simulate(
 ) -> SurveyRun:
     """Simulate a survey, in about a twentieth of its time; what is not given is as in the shipped configuration.
 
-    Decisions and estimates are those of ``ccatp run --sim`` with the same configuration, as long as the daemon's checks
-    of a fix (``survey.fix_gate``, ``survey.laser_follow``) find nothing: here they are not made, so that a fault of the
-    laser may give another result. ``settings``: dotted keys of the configuration; ``faults``: file of a fault plan.
-    ``keep_samples`` costs about 100 MB for a thousand seconds.
+    Decisions and estimates are those of ``ccatp run --sim`` with the same configuration. ``settings``: dotted keys of
+    the configuration; ``faults``: file of a fault plan. ``keep_samples`` costs about 100 MB for a thousand seconds.
     Raises ConfigError: a value cannot be used; PlanError: a point cannot be reached; NoFrames: a plan ends all frames.
     """
     named = {
@@ -108,7 +107,13 @@ class _ObservedRun(SilRun):
         """The tables of the run."""
         cfg, state, estimates = self.cfg, self.mission.state, self.trace.estimates()
         status = MissionStatus(
-            seq=0, t_s=result.mission_time_s, state=str(state.mode), cause=result.cause, outcome=result.outcome
+            seq=0,
+            t_s=result.mission_time_s,
+            state=str(state.mode),
+            cause=result.cause,
+            condition=state.cause.condition,
+            outcome=str(state.outcome),
+            exit_status=-1 if state.outcome else ExitStatus.HELD,
         )
         session = RecordedSession(
             name="simulation",
@@ -139,16 +144,17 @@ class _ObservedRun(SilRun):
             measured=self.laser.measured,
             injected={panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments},
         )
+        findings = findings_of(record)
         return SurveyRun(
             name=record.name,
             is_simulation=True,
             summary=result.summary,
-            warnings=(),
+            warnings=findings.warnings,
             config=cfg,
             alarms=table_of_records(ALARM_COLUMNS, self._alarms),
             frames=lambda: (self._frames(),),
             sample_kinds=KINDS,
-            findings=findings_of(record),
+            findings=findings,
         )
 
     def _points(self) -> tuple[StoredPoint, ...]:

@@ -172,8 +172,9 @@ def _why_far(mirror: Mirror, points: Sequence[ForeignPoint], world: FloatArray, 
     for factor, text in ((1e3, "metres"), (25.4, "inches"), (1e-3, "thousandths of the unit given")):
         scaled = np.abs(_heights(mirror, world[far] * factor)[:, 2]) < _ON_MIRROR_M + abs(offset_m)
         if scaled.all():
-            some = "these lines are" if not far.all() else "the file is"
-            return f"{where}: {some} in {text}, mixed units; {int(far.sum())} of {len(points)} points are so"
+            if far.all():
+                return f"{where}: the file is in {text}; {'convert it to mm' if factor == 25.4 else 'give --unit'}"
+            return f"{where}: mixed units, {int(far.sum())} of {len(points)} points are in {text}"
     limit = 0.9 * len(world)
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):

@@ -35,6 +35,7 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.plant import LEG_PAUSE_S, LEVEL_SLOPE
 from ccatp.studies.sil_run import SilRun
+from ccatp.survey.fix_review import ReviewedFix
 
 # -- the record: true path, seams, fixes -------------------------------------------------------------------------------
 
@@ -132,14 +133,16 @@ class RecordedSilRun(SilRun):
         self._transitions += self._scanner.scan(frame.edge)
         super()._serve(frame, dt_s)
 
-    def _fuse(self, fix: Fix) -> None:
+    def _fuse(self, fix: Fix) -> ReviewedFix:
         plant, deck = self.robot.world.plant, self.localizer.deck_pose
         panel = self.mirror.nearest_panel(plant.x_m, plant.y_m)
         covariance = deck_foot(self.mirror, fix, self.cfg.robot.puck_height_m).covariance_m2
         error_m = plant.x_m - deck.x_m, plant.y_m - deck.y_m
         row = len(self._way) // WAY_COLUMNS - 1
-        self._fixes.append(StopFix(row, self.mission.state.measuring_point, panel, covariance, error_m))
-        super()._fuse(fix)
+        found = super()._fuse(fix)
+        if not found.doubt:
+            self._fixes.append(StopFix(row, self.mission.state.measuring_point, panel, covariance, error_m))
+        return found
 
 
 # -- the bound ---------------------------------------------------------------------------------------------------------

@@ -1,12 +1,14 @@
 """A whole mission in one process: the daemon's own localizer, danger rules, mission and gate against the sim.
 
 What the sockets carry is handed over directly; the order of events is that of lockstep, so that a mission here and a
-run of the daemon with the same configuration and seed go through the same states.
+run of the daemon with the same configuration and seed go through the same states. The laser system is always ready, and
+the disk stores every fix at once.
 """
 
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from math import hypot
 from typing import Any
@@ -21,7 +23,6 @@ from ccatp.daemon.loops.mission_runner import STILL, DriveCommand, TimedFrame
 from ccatp.daemon.loops.survey_pipeline import SurveyPipeline
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import MotorRobot, motor_robot
-from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.kinematics import difference
 from ccatp.links import multiline
 from ccatp.links.robot_codec import set_point_on_wire
@@ -40,8 +41,9 @@ from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.composition import SurveyParts, assemble
-from ccatp.survey.events import DONE, FixFailed, FixStored, Mode, PointMissed, SurveyOutcome
+from ccatp.survey.events import DONE, Fault, FixFailed, FixStored, Mode, PointMissed, SurveyOutcome
 from ccatp.survey.fix_gate import ApproachCounter
+from ccatp.survey.fix_review import REPEATS, ReviewedFix
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.statechart import Mission
 
@@ -74,7 +76,7 @@ class SilResult:
     stops: list[StopRow]
     corrections: int  # moves after a fix that showed the robot too far from its point
     counts: dict[str, int]
-    outcome: str
+    outcome: str  # of the mission; "faulted": nobody attends to a fault here, "unfinished": it takes far too long
     cause: str
     states_s: dict[str, float]
     track: FloatArray  # rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7)
@@ -142,6 +144,7 @@ class SilLaser:
         self._approaches = ApproachCounter(cfg.mission.correction_tolerance_m, cfg.mission.max_approaches)
         self._fixes: list[Measured] = []
         self.stops: list[StopRow] = []
+        self.lengths_m: dict[int, float] = {}  # of the last measurement, by channel
         self.counts = Counter[str]()  # of fixes, by what the test of their lengths says
 
     def fix(self, t_s: float, estimate: DeckPose) -> Fix:
@@ -149,10 +152,10 @@ class SilLaser:
         robot, channels = self._robot, self._mirror.channels
         puck = PuckTruth(robot.t_s, robot.world.puck_world(), robot.world.moved_m())
         data = multiline.ChannelData(self._etalon.records(channels, puck))
-        lengths_m, _ = multiline.valid_lengths(data, channels)
+        self.lengths_m, _ = multiline.valid_lengths(data, channels)
         expected_m = self._mirror.puck_world(estimate, self._cfg.robot.puck_height_m)
         try:
-            fix = self._judge.fix(t_s, expected_m, lengths_m)
+            fix = self._judge.fix(t_s, expected_m, self.lengths_m)
         except MultilaterationError:
             self.counts["fixes_refused"] += 1
             raise
@@ -370,15 +373,28 @@ class SilRun:
 
     def _measure(self, frame: Sensors) -> None:
         mission, localizer, laser = self.mission, self.localizer, self.laser
-        point = mission.state.measuring_point
+        point, review = mission.state.measuring_point, self.parts.fix_review
         row = None
         if point is not None:
             row = laser.stop_row(frame.t, point, self.trace.truth_at(frame.seq), localizer)
+        review.begin()
+        fix: Fix | None = None
         try:
-            fix = laser.fix(frame.t, localizer.deck_pose)
-            self._fuse(fix)
-        except (MultilaterationError, FixRefused) as error:
-            mission.handle(FixFailed(point, str(error), self.parts.heading_sigma_rad()))
+            fix = self._fix(frame.t)
+            found = self._fuse(fix)
+            for _ in range(REPEATS):
+                if found.doubt and not found.refusal:
+                    fix = self._fix(frame.t)
+                    found = self._fuse(fix)
+            doubt, refusal = found.doubt, found.refusal
+        except MultilaterationError as error:
+            expected_m = self.mirror.puck_world(localizer.deck_pose, self.cfg.robot.puck_height_m)
+            doubt, refusal = str(error), review.refusal_of(laser.lengths_m, expected_m)
+        if refusal:
+            mission.handle(Fault(refusal))
+            return
+        if doubt or fix is None:
+            mission.handle(FixFailed(point, doubt, self.parts.heading_sigma_rad()))
             return
         localizer.notices.clear()
         if point is not None and row is not None:
@@ -388,14 +404,19 @@ class SilRun:
                 return
         mission.handle(FixStored(point, self.parts.heading_sigma_rad()))
 
-    def _fuse(self, fix: Fix) -> None:
-        """A fix that contradicts the estimate is measured again until it is accepted or refused for good."""
-        while True:
-            try:
-                self.localizer.fuse_fix(fix)
-            except FixGated:
-                continue
-            return
+    def _fix(self, t_s: float) -> Fix:
+        """Measure, with the retries of the client (raises MultilaterationError of the last one)."""
+        for _ in range(self.cfg.etalon.retries):
+            with suppress(MultilaterationError):
+                return self.laser.fix(t_s, self.localizer.deck_pose)
+        return self.laser.fix(t_s, self.localizer.deck_pose)
+
+    def _fuse(self, fix: Fix) -> ReviewedFix:
+        """Review a fix, and fuse it if it is good."""
+        localizer = self.localizer
+        estimate, is_lost = localizer.deck_pose, self.mission.state.is_lost
+        expected_m = self.mirror.puck_world(estimate, self.cfg.robot.puck_height_m)
+        return self.parts.fix_review.take(localizer, fix, expected_m, estimate, is_lost=is_lost)
 
     def _result(self, mission_time_s: float) -> SilResult:
         state, misalignments = self.mission.state, self.robot.world.misalignments
@@ -411,7 +432,7 @@ class SilRun:
             stops=self.laser.stops,
             corrections=state.corrections,
             counts={**self.localizer.counts, **self.laser.counts},
-            outcome=str(state.outcome if state.mode is DONE else SurveyOutcome.STOPPED),
+            outcome=str(state.outcome) or ("faulted" if state.is_faulted else "unfinished"),
             cause=text_of(state.cause),
             states_s={str(state): time_s for state, time_s in self.states_s.items()},
             track=track,

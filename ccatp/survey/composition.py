@@ -20,6 +20,9 @@ from ccatp.localizer import Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.rest import ALMOST_AT_REST_M_S, ALMOST_AT_REST_RAD_S
 from ccatp.survey.events import HELD, IDLE, MEASURING, SETTLING, Mode, TakenOver
+from ccatp.survey.fix_gate import FixGate
+from ccatp.survey.fix_review import FixReview
+from ccatp.survey.laser_follow import LaserFollow
 from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner, plan_survey
 from ccatp.survey.planning.search import path_time
 from ccatp.survey.state import SurveyState
@@ -107,6 +110,7 @@ class SurveyParts:
     localizer: Localizer
     mission: Mission
     gate: DriveGate
+    fix_review: FixReview
     thrust: ThrustControl
     route: Route
     points: tuple[PointId, ...]
@@ -167,6 +171,7 @@ def assemble(cfg: Config, done: Sequence[PointId] = (), checkpoint: Checkpoint |
         localizer=localizer,
         mission=mission,
         gate=DriveGate(cfg.limits, cfg.robot, cfg.mission.verdict_timeout_s),
+        fix_review=FixReview(FixGate(mirror, cfg), LaserFollow(cfg)),
         thrust=ThrustControl(cfg.robot, mirror),
         route=route,
         points=tuple(points),

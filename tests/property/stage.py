@@ -17,7 +17,6 @@ from ccatp.control.gate import FanGate, Purpose
 from ccatp.core import Cause, EdgeSample, EventCode, PointId, Stop, Twist, Verdict, WheelSample
 from ccatp.daemon.loops.mission_runner import STILL, TimedFrame
 from ccatp.danger import DangerMonitor
-from ccatp.estimation.fixes import FixRefused
 from ccatp.kinematics import twist_of
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import is_estimate_due
@@ -210,10 +209,13 @@ class Stage(SilRun):
         if self.trouble.fixes_fail:
             mission.handle(FixFailed(point, "no fix"))
             return
+        self.parts.fix_review.begin()
         try:
-            self._fuse(self.laser.fix(frame.t, self.localizer.deck_pose))
-        except (MultilaterationError, FixRefused) as error:
-            mission.handle(FixFailed(point, str(error)))
+            doubt = self._fuse(self.laser.fix(frame.t, self.localizer.deck_pose)).doubt
+        except MultilaterationError as error:
+            doubt = str(error)
+        if doubt:
+            mission.handle(FixFailed(point, doubt))
             return
         if point is not None:
             self.acknowledged.append(point)

@@ -17,8 +17,8 @@ import numpy as np
 from ccatp.conditions import text_of
 from ccatp.config.models import Config
 from ccatp.control.wheel_motion import SentDrives
-from ccatp.core import DeckPose, Fix, PointId, Severity, Vector3, Verdict
-from ccatp.daemon.loops.fix_service import FixChecks, FixRequest, FixService
+from ccatp.core import NO_CAUSE, DeckPose, Fix, PointId, Severity, Vector3, Verdict
+from ccatp.daemon.loops.fix_service import FixRequest, FixService
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry
@@ -30,8 +30,8 @@ from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import Checkpoint, SurveyParts, take_over
 from ccatp.survey.events import Fault, FixFailed, FixStored, Mode, SurveyInput, TakenOver
-from ccatp.survey.fix_gate import FixGate, nis_of
-from ccatp.survey.laser_follow import LaserFollow
+from ccatp.survey.fix_gate import nis_of
+from ccatp.survey.fix_review import FixReview
 from tests.support.virtual_time import VirtualLoop
 
 T = TypeVar("T")
@@ -150,7 +150,7 @@ def fix_service(
     mission: Any,
     *,
     localizer: Any = None,
-    gate: Any = None,
+    review: Any = None,
     on_finished: Callable[[], None] = lambda: None,
     publish: Callable[[str, Any], None] = lambda *_: None,
     notify: Callable[[str, str], None] = lambda *_: None,
@@ -162,9 +162,9 @@ def fix_service(
     ``not_ready``: so many times the lasers are not warm yet.
     """
     ready = iter((False,) * not_ready)
-    gate = gate or SimpleNamespace(
-        begin=lambda: None, review=lambda *_, **__: SimpleNamespace(doubt="", refusal=""), refusal_of=lambda *_: ""
-    )
+    passed = SimpleNamespace(doubt="", refusal=NO_CAUSE)
+    gate: Any = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: passed, refusal_of=lambda *_: NO_CAUSE)
+    follow: Any = SimpleNamespace(begin=lambda: None, doubt=lambda _: "", is_certain=False)
 
     async def is_laser_ready() -> bool:
         return next(ready, True)
@@ -175,11 +175,10 @@ def fix_service(
         localizer=localizer or sightless(),
         mission=mission,
         heading_sigma_rad=float,
+        fix_review=review or FixReview(gate, follow),
     )
-    follow = SimpleNamespace(begin=lambda: None, doubt=lambda _: "", is_certain=False)
     return FixService(
         cast(EtalonClient, SimpleNamespace(measure=measure, is_laser_ready=is_laser_ready)),
-        FixChecks(gate, cast(LaserFollow, follow)),
         cast(SurveyParts, parts),
         store,
         cast(Telemetry, SimpleNamespace(send=publish, notify_operator=notify, seq=0)),
@@ -293,7 +292,7 @@ class MeasuredSurvey(SilRun):
                 patient(store),
                 self.mission,
                 localizer=self.localizer,
-                gate=FixGate(self.mirror, self.cfg),
+                review=self.parts.fix_review,
                 on_finished=self._over.set,
                 publish=self._note_fix,
                 notify=lambda level, text: self.said.append(f"{level}: {text}"),

@@ -10,29 +10,25 @@ from ccatp.conditions import text_of
 from ccatp.conditions.mission import (
     DISK_STALLS,
     FIX_NOT_STORED,
-    LASER_NOT_FOLLOWING,
     LASER_NOT_READY,
     METROLOGY_UNRELIABLE,
     SKIP_NOT_STORED,
 )
 from ccatp.core import NO_CAUSE, UNRELIABLE, Cause, DeckPose, Fix, PointId, Vector3
-from ccatp.estimation.fixes import FixRefused
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.bus import Telemetry
 from ccatp.links.topics import FixMessage
 from ccatp.records.store import AlreadyMeasuredError, MissionStore, StoreError
 from ccatp.survey.composition import SurveyParts
 from ccatp.survey.events import Fault, FixFailed, FixStored, PointMissed
-from ccatp.survey.fix_gate import ApproachCounter, FixGate
-from ccatp.survey.laser_follow import LaserFollow
+from ccatp.survey.fix_gate import ApproachCounter
+from ccatp.survey.fix_review import REPEATS
 
 # A commit takes milliseconds, or a second on a busy disk. After these times it is reported, then holds the robot.
 SLOW_DISK_S = 2.0
 STALLED_DISK_S = 30.0
 # Periods of the requests whether the lasers are warm, and of the reports that they are not.
 LASER_PERIOD_S, LASER_REPORT_S = 1.0, 60.0
-# Number of repeated measurements of a doubtful fix.
-REPEATS = 2
 
 
 class LaserUnusable(EtalonError):
@@ -54,14 +50,6 @@ class FixRequest:
     estimate: DeckPose
 
 
-@dataclass(frozen=True, slots=True)
-class FixChecks:
-    """What judges a fix before it is fused: by the estimate, and by the robot's motion since the one before."""
-
-    gate: FixGate
-    follow: LaserFollow
-
-
 class FixHost(Protocol):
     """What the service needs of the main loop."""
 
@@ -79,7 +67,6 @@ class FixService:
     def __init__(
         self,
         client: EtalonClient,
-        checks: FixChecks,
         parts: SurveyParts,
         store: MissionStore,
         telemetry: Telemetry,
@@ -87,8 +74,7 @@ class FixService:
     ) -> None:
         mission, etalon = parts.cfg.mission, parts.cfg.etalon
         self._client = client
-        self._fix_gate = checks.gate
-        self._follow = checks.follow
+        self._review = parts.fix_review
         self._localizer = parts.localizer
         self._mission = parts.mission
         self._heading_sigma_of = parts.heading_sigma_rad
@@ -134,8 +120,7 @@ class FixService:
 
     async def _serve(self, request: FixRequest) -> None:
         """Measure, and repeat a doubtful fix, within the time limit of a point."""
-        self._fix_gate.begin()
-        self._follow.begin()
+        self._review.begin()
         try:
             await self._await_laser(request)
             async with asyncio.timeout(self._timeout_s):
@@ -177,31 +162,20 @@ class FixService:
 
     def _fuse(self, request: FixRequest, fix: Fix) -> str:
         """Fuse a fix unless it is doubted; returns the reason, or an empty text."""
-        localizer = self._localizer
-        finding = self._fix_gate.review(
-            fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.state.is_lost
-        )
-        stuck = self._follow.doubt(fix)
-        doubt, jump_m = finding.doubt or text_of(finding.refusal) or stuck, 0.0
-        is_set_aside = bool(doubt)
-        if not is_set_aside:
-            try:
-                jump_m = localizer.fuse_fix(fix)
-            except FixRefused as refusal:
-                doubt = str(refusal)
+        localizer, is_lost = self._localizer, self._mission.state.is_lost
+        found = self._review.take(localizer, fix, request.expected_m, request.estimate, is_lost=is_lost)
+        doubt, jump_m = found.doubt, found.jump_m
         message = FixMessage(
             seq=self._telemetry.seq,
             point=None if request.point is None else (*request.point,),
             is_fused=not doubt,
             jump_mm=1e3 * jump_m,
-            is_set_aside=is_set_aside,
+            is_set_aside=found.is_set_aside,
             **asdict(fix),
         )
         self._telemetry.send("fix", message)
-        if finding.refusal:
-            raise LaserUnusable(finding.refusal)
-        if stuck and self._follow.is_certain:
-            raise LaserUnusable(LASER_NOT_FOLLOWING.cause(count=self._follow.standstills))
+        if found.refusal:
+            raise LaserUnusable(found.refusal)
         if doubt:
             self._notify("info", f"the fix at {_name(request.point)} is not used: {doubt}")
             return doubt
@@ -214,7 +188,7 @@ class FixService:
 
     async def _fail(self, request: FixRequest, why: str, error: Exception | None) -> None:
         if isinstance(error, BadSolution):
-            refusal = self._fix_gate.refusal_of(error.lengths_m, request.expected_m)
+            refusal = self._review.refusal_of(error.lengths_m, request.expected_m)
             error = LaserUnusable(refusal) if refusal else error
         if isinstance(error, LaserUnusable):
             self._notify("error", str(error))

@@ -58,6 +58,7 @@ class SurveyPipeline:
     def estimate(self, frame: TimedFrame) -> None:
         """Pass the frame's samples to the localizer, as far as they are trusted."""
         sensors, mission, localizer = frame.sensors, self.mission, self.localizer
+        self.parts.fix_review.add(sensors.imu, sensors.enc)
         start, self._start = self._start, None
         if start is not None:  # a replay needs the start pose of a localizer that takes over
             begun, sigmas = start

@@ -10,7 +10,7 @@ from ccatp.control.gate import FanGate
 from ccatp.core import Cause, Verdict
 from ccatp.daemon.loops.checkpoint_writer import CheckpointWriter
 from ccatp.daemon.loops.checkpoints import build_parts
-from ccatp.daemon.loops.fix_service import FixChecks, FixRequest, FixService
+from ccatp.daemon.loops.fix_service import FixRequest, FixService
 from ccatp.daemon.loops.gate_log import GateLog
 from ccatp.daemon.loops.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionHost, MissionRunner, TimedFrame
 from ccatp.daemon.loops.survey_pipeline import SurveyPipeline
@@ -35,9 +35,7 @@ from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.composition import SurveyParts
 from ccatp.survey.events import Fault, Interrupted, Mode, SurveyOutcome, TrackingGap
-from ccatp.survey.fix_gate import FixGate
 from ccatp.survey.forecast import forecast_time
-from ccatp.survey.laser_follow import LaserFollow
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import by_reason
 from ccatp.survey.statechart import Mission
@@ -76,9 +74,7 @@ class SurveyRunner(MissionRunner):
         self._fan_gate = FanGate(0.0)
         self._fans_seq = 0
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
-        self._follow = LaserFollow(cfg)
-        checks = FixChecks(FixGate(parts.mirror, cfg), self._follow)
-        self._fix_service = FixService(self._etalon, checks, parts, store, telemetry=self.telemetry, host=host)
+        self._fix_service = FixService(self._etalon, parts, store, telemetry=self.telemetry, host=host)
         self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
@@ -202,7 +198,6 @@ class SurveyRunner(MissionRunner):
     # -- the frame ------------------------------------------------------------------------------------------------
 
     def estimate(self, frame: TimedFrame) -> None:
-        self._follow.add(frame.sensors.imu, frame.sensors.enc)
         self._pipeline.estimate(frame)
 
     def record_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:

@@ -21,6 +21,7 @@ from ccatp.links.topics import FixMessage, SensorLines
 from ccatp.records.recorder import RECORD_FORMAT
 from ccatp.sim.robot import Robot
 from ccatp.studies.sil_run import SilRun
+from ccatp.survey.fix_review import ReviewedFix
 from tests.support.command import answered, printed, refused
 from tests.support.recorded import recorder_in
 
@@ -49,9 +50,9 @@ class CalibrationDrive(SilRun):
         self.frames.append(frame)
         super()._serve(frame, dt_s)
 
-    def _fuse(self, fix: Fix) -> None:
+    def _fuse(self, fix: Fix) -> ReviewedFix:
         self.fixes.append((self.frames[-1].seq, fix))
-        super()._fuse(fix)
+        return super()._fuse(fix)
 
     @property
     def drive(self) -> RecordedDrive:

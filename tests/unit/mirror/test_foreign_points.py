@@ -209,7 +209,7 @@ def one_name(lines: list[str]) -> list[str]:
 
 
 REFUSED: dict[str, tuple[Callable[[list[str]], list[str]], tuple[str, ...], str]] = {
-    "mixed units": (mixed, (), "in metres, mixed units; 1 of 27 points"),
+    "mixed units": (mixed, (), "mixed units, 1 of 27 points are in metres"),
     "all in metres": (lambda lines: lines, ("--unit", "um"), "is not on fyst-m1"),
     "swapped axes": (swapped, (), "with (y, x, z) in place of (x, y, z) the points lie on it"),
     "left-handed": (mirrored, (), "names panel 5/4, and lies on 5/6, as 18 of 27 points do: a left-handed frame"),

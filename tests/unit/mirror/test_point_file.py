@@ -124,7 +124,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
     "NaN": (changed(3, "4/5/3,nan,1.0,2.0"), SIGMA, "x is 'nan', which is no number"),
     "infinite": (changed(3, "4/5/3,1.0,inf,2.0"), SIGMA, "y is 'inf', which is no number"),
     "one line in m": (
-        changed(5, "4/5/5," + ",".join(str(v / 1e3) for v in POINTS[4])), SIGMA, "in metres, mixed units",
+        changed(5, "4/5/5," + ",".join(str(v / 1e3) for v in POINTS[4])), SIGMA, "mixed units, 1 of",
     ),
     "all in m": (renamed(NAMES, POINTS / 1e3), SIGMA, "in metres"),
     "all in inches": (renamed(NAMES, POINTS / 25.4), SIGMA, "in inches"),
