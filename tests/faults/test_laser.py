@@ -72,7 +72,7 @@ def is_point(m: LaserRequest, *numbers: int) -> bool:
     [
         pytest.param((5,), 1, "complete", 9, 0, [], id="once: measured at the end"),
         pytest.param((5,), 99, "complete", 8, 1, ["no reply"], id="twice: told with its reason"),
-        pytest.param(range(1, 7), 99, "stopped", 3, 3, [], id="three in a row hold the mission"),
+        pytest.param(range(1, 7), 99, "faulted", 3, 3, [], id="three in a row hold the mission"),
     ],
 )  # fmt: skip
 def test_points_that_fail(

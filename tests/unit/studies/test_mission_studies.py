@@ -275,7 +275,7 @@ def test_fans_that_seem_to_fail_on_an_overhang_wait_for_an_operator(signal: str,
 
 def test_a_cell_names_the_missions_that_are_not_complete() -> None:
     injected: Any = {"injected": {"planned": 12, "acted": 11}}
-    ended: Any = {"is_recoverable": False, "weak_frames": 4, "outcome": "stopped", "cause": "held"}
+    ended: Any = {"is_recoverable": False, "weak_frames": 4, "outcome": "faulted", "cause": "held"}
     whole = mission([0.001], seed=1, is_recoverable=True, weak_frames=0, **injected)
     values, _ = faults_study.STUDY.combine({}, [whole, mission([0.001], seed=2, **ended, **injected)])
     assert (values["complete"], values["ended"]) == (1, ["seed 2 stopped: held"])
