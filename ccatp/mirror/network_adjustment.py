@@ -2,10 +2,10 @@
 
 Every effect has the prior of the configuration. One that the lengths contradict gets a wide prior, ``moved`` (stepwise:
 the score test of each candidate, the most significant first). Candidates are the effects themselves, the same from
-some point on (but for the drift), and single lengths, which are not used if they are significant. The probability of a
-false finding per survey is half of the configured one. If another candidate explains the lengths nearly as well, both
-get the wide prior, and both are named. An effect that is suspect only (chance ``_SUSPECT``) gets the wide prior, too,
-and is not named.
+some point on (but for the drift), those of a channel until a later survey begins, and single lengths, which are not
+used if they are significant. The probability of a false finding per survey is half of the configured one. If another
+candidate explains the lengths nearly as well, both get the wide prior, and both are named. An effect that is suspect
+only (chance ``_SUSPECT``) gets the wide prior, too, and is not named.
 
 Errors of scale and drift that are too small for the test are larger than the noise of the panels. At the end each of
 the two, if it was not found, has the mean of the usual and the wide prior, weighted by the probability of each with
@@ -14,7 +14,7 @@ these lengths: ``prior_of_both``.
 The noise of the lengths is measured with all effects free, so that larger noise makes no findings.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from enum import StrEnum
 from math import log, sqrt
 from typing import NamedTuple
@@ -140,7 +140,7 @@ class NetworkSearch:
         self._prices = {
             size: (
                 float(chdtri(size, 0.05 * false_alarm / len(self.effects))),
-                change_price(size, 0.25 * false_alarm / (2 * channels + given.surveys), count),
+                change_price(size, 0.25 * false_alarm / (2 * channels * given.surveys + given.surveys), count),
             )
             for size in (1, 3)
         }
@@ -202,7 +202,7 @@ class NetworkSearch:
 
     def _narrowed(self, found: _Search, effect: Effect) -> _Search:
         sigmas = {one: sigma for one, sigma in found.sigmas.items() if one != effect}
-        if effect.since == 0:
+        if effect.is_always:
             sigmas = {**found.sigmas, effect: self._usual[effect.kind]}
         return found._replace(sigmas=sigmas, wide=found.wide - {effect})
 
@@ -254,7 +254,7 @@ class NetworkSearch:
         """Without effects that were widened before and are no longer significant."""
         for effect in found.wide - {newest}:
             values, covariance = adjustment.of(effect), adjustment.covariance_of(effect)
-            usual = self._usual[effect.kind] ** 2 if effect.since == 0 else 0.0
+            usual = self._usual[effect.kind] ** 2 if effect.is_always else 0.0
             spread = covariance + usual * np.eye(effect.size)
             if float(values @ np.linalg.solve(spread, values)) < self._price(effect):
                 found = self._narrowed(found, effect)
@@ -262,17 +262,19 @@ class NetworkSearch:
         return found, adjustment
 
     def _price(self, effect: Effect) -> float:
-        return self._prices[effect.size][effect.since > 0]
+        return self._prices[effect.size][not effect.is_always]
 
     def _gains(self, found: _Search, adjustment: Adjustment, also: int = 0) -> dict[Effect, float]:
-        """The best candidate of each kind, channel or survey, always and since some point, with what it gains.
+        """The best candidate of each kind, channel or survey, and each end, with what it gains.
 
+        One holds always, from some point on, or until a later survey begins, from the first point or from another one.
         ``also``: a point at which a change may begin, besides those of the grid.
         """
         given, gains = self._used(found), {}
-        for base in self.effects:
+        for base in self._bases():
             grid = self._firsts(base)
             firsts = np.unique([0, also, *grid]) if len(grid) else np.array([0])
+            firsts = firsts[firsts < base.until] if base.until else firsts
             gained = score_since(adjustment, base, given, firsts)
             if base not in found.wide:
                 gains[base] = float(gained[0]) - self._price(base)
@@ -283,12 +285,22 @@ class NetworkSearch:
                     gains[step] = float(gained[at]) - self._price(step)
         return gains
 
+    def _bases(self) -> Iterator[Effect]:
+        """All effects, and those of a channel until each later survey begins."""
+        yield from self.effects
+        begins = np.flatnonzero(np.diff(self._given.survey)) + 1
+        for effect in self.effects:
+            if effect.is_of_channel:
+                yield from (effect._replace(until=int(begin)) for begin in begins)
+
     def _firsts(self, base: Effect) -> IntArray:
         """Points at which a change may begin, some apart."""
         if base.kind is EffectKind.DRIFT:
             return np.arange(0)
         survey = self._given.survey
-        inside = np.flatnonzero(survey == base.of) if base.kind is EffectKind.SCALE else np.arange(len(survey))
+        inside = (
+            np.flatnonzero(survey == base.of) if base.kind is EffectKind.SCALE else np.arange(len(survey))[base.part]
+        )
         inside = inside[_LEAST_PART:-_LEAST_PART]
         return inside[:: max(1, -(-len(inside) // _GRID))]
 
@@ -302,7 +314,8 @@ class NetworkSearch:
         )
         gain = gains[best]
         if best.since:
-            near = np.arange(max(best.since - self._apart, 1), min(best.since + self._apart, len(self._given.survey)))
+            end = best.until or len(self._given.survey)
+            near = np.arange(max(best.since - self._apart, 1), min(best.since + self._apart, end))
             gained = score_since(adjustment, best._replace(since=0), self._used(found), near)
             gain, best = float(gained.max()) - self._price(best), best._replace(since=int(near[np.argmax(gained)]))
         return gain, best

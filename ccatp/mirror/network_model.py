@@ -31,11 +31,26 @@ class EffectKind(StrEnum):
 
 
 class Effect(NamedTuple):
-    """One block of unknowns: of a channel (its column), or of a survey (its number), from a point on (0: always)."""
+    """One block of unknowns: of a channel (its column), or of a survey (its number).
+
+    ``since``: the first point at which it holds. ``until``: the first one after it at which it does not hold any more,
+    the beginning of a later survey; 0: it holds to the end.
+    """
 
     kind: EffectKind
     of: int
     since: int = 0
+    until: int = 0
+
+    @property
+    def part(self) -> slice:
+        """The points at which it holds."""
+        return slice(self.since, self.until or None)
+
+    @property
+    def is_always(self) -> bool:
+        """Whether it holds at all points."""
+        return not (self.since or self.until)
 
     @property
     def size(self) -> int:
@@ -124,7 +139,7 @@ def columns_of(effect: Effect, given: SurveyLengths, directions: FloatArray, dis
     """Change of each length per unknown of an effect, (k, m, size)."""
     count, channels = distances_m.shape
     found = np.zeros((count, channels, effect.size))
-    part = slice(effect.since, None)
+    part = effect.part
     match effect.kind:
         case EffectKind.OFFSET:
             found[part, effect.of, 0] = 1.0
@@ -150,16 +165,16 @@ def _predict(given: SurveyLengths, slices: dict[Effect, slice], values: FloatArr
     offsets = np.zeros((count, channels))
     scale = np.zeros(count)
     for effect, part in slices.items():
-        since = slice(effect.since, None)
+        at = effect.part
         match effect.kind:
             case EffectKind.OFFSET:
-                offsets[since, effect.of] += values[part]
+                offsets[at, effect.of] += values[part]
             case EffectKind.COLLIMATOR:
-                moved[since, effect.of] += values[part]
+                moved[at, effect.of] += values[part]
             case EffectKind.SCALE:
-                scale[since] += values[part] * (given.survey[since] == effect.of)
+                scale[at] += values[part] * (given.survey[at] == effect.of)
             case EffectKind.DRIFT:
-                scale[since] += values[part] * given.hours[since] * (given.survey[since] == effect.of)
+                scale[at] += values[part] * given.hours[at] * (given.survey[at] == effect.of)
     away = points_m[:, None, :] - given.collimators_m - moved
     distances = np.sqrt(np.sum(away * away, axis=2))
     directions = away / np.maximum(distances, 1e-12)[..., None]
@@ -279,7 +294,7 @@ def _shown(score: FloatArray, own: FloatArray, cross: FloatArray, covariance: Fl
 def score_since(found: Adjustment, base: Effect, given: SurveyLengths, firsts: IntArray) -> FloatArray:
     """The chi-square that an additional effect would take away if it began at each of the points ``firsts``.
 
-    This is the score test: exact in the linear model. ``firsts`` grow.
+    This is the score test: exact in the linear model. ``firsts`` grow, and are before the end of ``base``.
     """
     columns = columns_of(base, given, found.directions, found.distances_m)
 

@@ -124,11 +124,12 @@ def _change(found: CalibratedSurveys, finding: Finding) -> str:
 
 
 def _since(found: CalibratedSurveys, effect: Effect) -> str:
+    until = f" until survey {found.network.given.survey[effect.until] + 1} begins" if effect.until else ""
     if not effect.since:
-        return _of_survey(found, effect)
+        return _of_survey(found, effect) + until
     point, t_s = found.points[effect.since]
     survey = f" of survey {found.network.given.survey[effect.since] + 1}" if len(found.surveys) > 1 else ""
-    return f" since about point {'/'.join(map(str, point))}{survey} ({t_s:.0f} s by the robot's clock)"
+    return f" since about point {'/'.join(map(str, point))}{survey} ({t_s:.0f} s by the robot's clock){until}"
 
 
 def _of_survey(found: CalibratedSurveys, effect: Effect) -> str:
@@ -153,10 +154,10 @@ def _joined(found: CalibratedSurveys, effects: Iterable[Effect]) -> str:
     """Effects of one kind together."""
     parts = []
     for kind, name in ((EffectKind.COLLIMATOR, "collimators"), (EffectKind.OFFSET, "offsets of channels")):
-        numbers = [found.channels[one.of] for one in effects if one.kind is kind and not one.since]
+        numbers = [found.channels[one.of] for one in effects if one.kind is kind and one.is_always]
         if numbers:
             parts.append(f"{name} {' '.join(map(str, numbers))}")
-    rest = [one for one in effects if one.since or not one.is_of_channel]
+    rest = [one for one in effects if not (one.is_always and one.is_of_channel)]
     return ", ".join([*parts, *(effect_name(found, one) for one in rest)])
 
 
@@ -215,7 +216,8 @@ def network_data(found: CalibratedSurveys | None) -> dict[str, Any] | None:
 def _effect_data(found: CalibratedSurveys, effect: Effect) -> dict[str, Any]:
     name = {"channel": found.channels[effect.of]} if effect.is_of_channel else {"survey": effect.of}
     since = list(found.points[effect.since][0]) if effect.since else None
-    return {"kind": effect.kind.value, **name, "since": since}
+    until = list(found.points[effect.until][0]) if effect.until else None
+    return {"kind": effect.kind.value, **name, "since": since, "until": until}
 
 
 def _values(effect: Effect, values: FloatArray, sigmas: FloatArray) -> dict[str, Any]:

@@ -406,3 +406,21 @@ def test_a_slip_in_the_second_of_two_surveys_is_said_to_be_there() -> None:
     text = sentence(network)
     assert text.startswith("The laser network has changed: channel 3 reads 3")
     assert " of survey 2 (" in text
+
+
+def slipped_all_along(_: int, some: dict[int, float]) -> dict[int, float]:
+    return some | {3: some[3] + 3e-4}
+
+
+@pytest.mark.parametrize(("change", "since"), [(slipped, 12), (slipped_all_along, 0)])
+def test_a_slip_that_is_gone_in_the_second_of_two_surveys_is_one_change(
+    change: Callable[[int, dict[int, float]], dict[int, float]], since: int
+) -> None:
+    surveys = [survey(one, LIES) for one in (change, as_it_is)]
+    network = align_survey(CFG, M1, surveys[0], PANELS, surveys[1:]).network
+    assert network is not None
+    (finding,) = network.network.findings
+    assert finding.effect == Effect(EffectKind.OFFSET, 2, since, until=len(surveys[0]))
+    assert finding.size == pytest.approx(3e-4, abs=4.0 * finding.sigma)
+    assert network.network.suspects == ()
+    assert " until survey 2 begins (noise as configured)" in sentence(network)
