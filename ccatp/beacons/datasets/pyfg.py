@@ -31,7 +31,7 @@ def is_pyfg(text: str) -> bool:
 
 
 def read_pyfg(file: Path) -> Recording:
-    """Read one vehicle's run: its odometry edges and its ranges to landmarks; vertices are the truth.
+    """Read one vehicle's run: its odometry edges and its ranges to landmarks; vertices with values are the truth.
 
     Raises RadioDataError: a line is not of a graph in the plane, or the graph has no odometry.
     """
@@ -108,7 +108,8 @@ def _events(
         elif kind.endswith("PRIOR") or match is None or match[1] != vehicle or int(match[2]) not in times_s:
             continue
         elif kind == "VERTEX_SE2":
-            yield "truth", line, [times_s[int(match[2])], *values]
+            if not np.isnan(values).all():
+                yield "truth", line, [times_s[int(match[2])], *values]
         elif kind == "EDGE_SE2":
             if other is None or other[1] != vehicle or int(other[2]) != int(match[2]) + 1:
                 left_out["loop closure"] = left_out.get("loop closure", 0) + 1
@@ -132,7 +133,8 @@ def _events(
 def pyfg_lines(run: RecordedRun, assumed: RecordingConfig, poses: FloatArray) -> list[str]:
     """The run as a graph: a pose at each time of a reading, odometry between them, ranges, surveyed landmarks.
 
-    ``poses``: x_m, y_m, heading_rad at each odometry time, which become the values of the vertices, shape (n + 1, 3).
+    ``poses``: true x_m, y_m, heading_rad at each odometry time, NaN where not known, shape (n + 1, 3). The format knows
+    no other values of vertices: an estimate in them would be the truth for every reader.
     """
     steps, seen = run.steps, run.readings.where(np.isfinite(run.readings.range_m))
     t = np.unique(np.concatenate([steps.times_s[:1], seen.times_s]))

@@ -10,6 +10,7 @@ from ccatp.beacons.config.models import RecordingConfig
 from ccatp.beacons.datasets.pyfg import pyfg_lines
 from ccatp.beacons.datasets.sheets import write_beacons
 from ccatp.beacons.datasets.tables import RadioDataError
+from ccatp.beacons.estimation.evaluation import truth_at
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.estimation.track_review import range_residuals
 from ccatp.core import FloatArray
@@ -32,8 +33,9 @@ def write_slam(folder: Path, run: RecordedRun, track: EstimatedPath, assumed: Re
         if (late := track.delayed) is not None:
             _write(folder / "path_delayed.csv", PATH, _path_rows(late.times_s, late.poses, late.covariances))
         _write(folder / "readings.csv", READINGS, _reading_rows(run, track, assumed.radio.camera_field_rad))
-        poses = np.column_stack([np.interp(run.steps.times_s, track.times_s, column) for column in track.poses.T])
-        graph = "\n".join(pyfg_lines(run, assumed, poses)) + "\n"
+        times_s = run.steps.times_s
+        true = np.full((len(times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, times_s)
+        graph = "\n".join(pyfg_lines(run, assumed, true)) + "\n"
         (folder / "graph.pyfg").write_text(graph, encoding="utf-8")
     except OSError as error:
         raise RadioDataError(error.filename or folder, f"cannot be written: {error.strerror or error}") from error

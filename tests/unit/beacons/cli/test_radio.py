@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
+from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.estimation.evaluation import judge
 from ccatp.beacons.estimation.recording import KnownMap
 from ccatp.beacons.studies.gtsam_peer import PeerError, PeerGaveUp, run_gtsam
@@ -101,6 +102,11 @@ def test_the_result_is_written_as_files_of_which_the_graph_is_read_again(
     assert len(used) == data["updates"]
     graph = reported(capsys, "slam", out_dir / "graph.pyfg", "--json")
     assert graph["beacon_rmse_m"] < 0.5
+    true, again = (read_run(file, None, None).truth for file in (recording, out_dir / "graph.pyfg"))
+    assert true is not None
+    assert again is not None
+    for own, of_graph in zip(true[1:], again[1:], strict=True):  # x, y and heading
+        assert of_graph == pytest.approx(np.interp(again.times_s, true.times_s, own), abs=1e-6)  # nine decimals
     status, _, err = said(capsys, "radio", "slam", recording, "--out", recording)
     assert status == 2
     assert "cannot be written" in err
@@ -114,6 +120,10 @@ def test_what_is_not_known_is_null(tmp_path: Path, capsys: pytest.CaptureFixture
     unknown = ("trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "nees_mean", "range_scale")
     assert {data[key] for key in unknown} == {None}
     assert len(data["beacons"]) == len(BEACONS)
+    reported(capsys, "slam", file, "--out", tmp_path / "out", "--json")
+    graph = reported(capsys, "slam", tmp_path / "out/graph.pyfg", "--json")
+    assert {graph[key] for key in unknown[:4]} == {None}
+    assert any("no reference trajectory" in line for line in graph["warnings"])
 
 
 def test_a_truth_of_one_row_is_no_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
