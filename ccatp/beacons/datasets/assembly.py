@@ -24,7 +24,7 @@ from ccatp.core import FloatArray
 
 NOTHING = Known()
 LEAST_STEPS = 2
-MOST_ONCE = 20  # beacons that were heard once, if they are most of the readings
+MOST_ONCE = 20  # beacons that were received once, if they are most of the readings
 LEAST_TRUTH = 2  # rows; a single position fits any path
 LARGEST = {1: (1e3, "a step forward", "m"), 2: (1e4, "a turn", "rad"), 3: (1e3, "a step to the left", "m")}
 FARTHEST_M = 1e8  # of coordinates; those of maps reach 1e7

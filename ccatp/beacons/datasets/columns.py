@@ -271,7 +271,7 @@ def _readings(table: ColumnFile, numbers: dict[str, float]) -> Iterator[tuple[st
             raise RadioDataError(table.file, "the reading has no time", line)
         for k, column in readings:
             if not cells[k]:
-                continue  # an empty cell: the beacon was not heard
+                continue  # an empty cell: the beacon was not received
             name = beacon_name(column.beacon if named is None else cells[named])
             if not name:
                 raise RadioDataError(table.file, "the reading has no name of a beacon", line)

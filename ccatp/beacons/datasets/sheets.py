@@ -179,11 +179,11 @@ def read_level_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
     levels, warnings = _heard(numbers[:, 2:])
     found = []
     for (x_m, y_m), row in zip(numbers[:, :2].tolist(), levels.tolist(), strict=True):
-        heard = {node: level for node, level in zip(nodes, row, strict=True) if not np.isnan(level)}
-        if heard:
-            found.append(MeasuredPlace((x_m, y_m), heard))
+        received = {node: level for node, level in zip(nodes, row, strict=True) if not np.isnan(level)}
+        if received:
+            found.append(MeasuredPlace((x_m, y_m), received))
     if len(found) < len(numbers):
-        warnings.append(f"{plural(len(numbers) - len(found), 'place')} where no node was heard, not used")
+        warnings.append(f"{plural(len(numbers) - len(found), 'place')} where no node was received, not used")
     return table.name, tuple(found), warnings
 
 
@@ -220,12 +220,12 @@ def _read_logs(folder: Path, sheet: str | None, points: Path | None) -> Levels:
 
 
 def _heard(levels: FloatArray) -> tuple[FloatArray, list[str]]:
-    """Levels in dBm, shape (n, nodes), NaN for nodes that were not heard, and warnings."""
+    """Levels in dBm, shape (n, nodes), NaN for nodes that were not received, and warnings."""
     levels, warnings = levels.copy(), []
     node = np.broadcast_to(np.arange(levels.shape[1]), levels.shape)[np.isfinite(levels)]
     for value in placeholder_values("rssi", node.astype(np.float64), levels[np.isfinite(levels)]):
         is_it = levels == value
-        warnings.append(f"{plural(int(is_it.sum()), 'level')} of {value:g} dBm stand for nodes not heard, not used")
+        warnings.append(f"{plural(int(is_it.sum()), 'level')} of {value:g} dBm stand for nodes not received, not used")
         levels[is_it] = np.nan
     if np.isfinite(levels).any() and np.nanmin(levels) > 0.0:
         return -levels, [*warnings, "all levels are positive: taken for dBm without their sign"]

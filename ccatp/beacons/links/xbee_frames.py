@@ -170,7 +170,7 @@ def parse_node(data: bytes) -> Node | None:
     name, zero, rest = data[10:].partition(b"\0")
     if not zero:
         return None
-    if not rest:  # 802.15.4, where all modules hear each other directly
+    if not rest:  # 802.15.4, where all modules receive each other directly
         name, is_relayed = name[1:], False
     elif len(rest) >= 8:
         is_relayed = rest[2] == _END_DEVICE and int.from_bytes(rest[:2]) not in _COORDINATORS

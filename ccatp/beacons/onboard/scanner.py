@@ -220,11 +220,11 @@ class Scanner:
     def _finish(self, now_s: float) -> None:
         """Radios that did not answer once are left out."""
         self.counts["scans"] += 1
-        heard = {name: levels for name, levels in self._levels.items() if any(z is not None for z in levels)}
+        received = {name: levels for name, levels in self._levels.items() if any(z is not None for z in levels)}
         self._note_silence()
         t_s = round(now_s, _DIGITS)
         if self._dish is None:
-            samples = [RadioSample(t_s, name, z, None) for name, (z,) in heard.items() if z is not None]
+            samples = [RadioSample(t_s, name, z, None) for name, (z,) in received.items() if z is not None]
             self._result = ScanResult(None, samples)
-        elif heard:
-            self._result = ScanResult(RadioScan(t_s, tau / self._directions, heard), [])
+        elif received:
+            self._result = ScanResult(RadioScan(t_s, tau / self._directions, received), [])

@@ -97,8 +97,8 @@ class Coordinator(BeaconDevice):
 
     @property
     def identity(self) -> str:
-        """What it says of itself, and whom it hears."""
-        return f"{self._identity}; hears {', '.join(sorted(self.radios)) or 'nobody'}"
+        """What it says of itself, and whose packets it receives."""
+        return f"{self._identity}; receives {', '.join(sorted(self.radios)) or 'no radio'}"
 
     @property
     def missing(self) -> list[str]:
@@ -116,7 +116,7 @@ class Coordinator(BeaconDevice):
         if not self.is_ready:
             return self.why()
         if self.missing:
-            return f"does not hear {', '.join(self.missing)}"
+            return f"does not receive {', '.join(self.missing)}"
         if self.twins:
             return f"several radios have the name {', '.join(sorted(self.twins))}; set NI of each to another one"
         if self.relayed:

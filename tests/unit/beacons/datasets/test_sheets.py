@@ -89,8 +89,8 @@ def test_a_node_that_was_not_heard_is_an_empty_cell_or_a_placeholder(tmp_path: P
     assert places[-2].levels_dbm == {"B": -61.0}
     assert places[-1] == MeasuredPlace((15.0, 0.0), {"B": -62.0})
     assert len(places) == 15
-    assert warnings[0] == "3 levels of 100 dBm stand for nodes not heard, not used"
-    assert warnings[1] == "1 place where no node was heard, not used"
+    assert warnings[0] == "3 levels of 100 dBm stand for nodes not received, not used"
+    assert warnings[1] == "1 place where no node was received, not used"
 
 
 def test_a_folder_of_logs_with_their_distances(tmp_path: Path) -> None:

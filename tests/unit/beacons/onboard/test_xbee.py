@@ -56,7 +56,7 @@ class Rig:
 @pytest.mark.parametrize("is_zigbee", [True, False])
 def test_radios_are_found_and_their_strengths_are_their_own(api_mode: int, is_zigbee: bool) -> None:
     rig = Rig(api_mode=api_mode, is_zigbee=is_zigbee).open()
-    assert rig.radio.identity == "XBee 0013A20041AE0001 CRT, firmware 4060; hears beacon1, beacon2"
+    assert rig.radio.identity == "XBee 0013A20041AE0001 CRT, firmware 4060; receives beacon1, beacon2"
     assert rig.radio.wanted == NAMES
     assert not rig.radio.missing
     for level in (-40.0, -17.0, -19.0, -100.0):  # 11 and 13 in hexadecimal are escaped in mode 2
@@ -165,6 +165,7 @@ def test_a_radio_that_is_switched_on_later_is_found() -> None:
     late = rig.device.nodes.popitem()
     rig.open()
     assert rig.radio.missing == ["beacon2"]
+    assert rig.radio.fault() == "does not receive beacon2"
     rig.device.nodes[late[0]] = late[1]
     rig.run(40.0)
     assert not rig.radio.missing
