@@ -6,13 +6,13 @@ import json
 import math
 import os
 import re
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import reduce
 from pathlib import Path
-from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -240,28 +240,30 @@ def warn(warnings: Iterable[str]) -> None:
 
 @contextmanager
 def working(what: str) -> Iterator[None]:
-    """On a terminal, say after two seconds that a command works, and for how long; the line goes when it is done."""
+    """On a terminal, say after two seconds that a command works, and for how long; the line goes when it is done.
+
+    In the main thread, by a signal: with a second thread the report could not draw on two cores (``report.html``).
+    """
     if not sys.stderr.isatty():
         yield
         return
-    is_done = Event()
+    begun_s, line = time.monotonic(), ""
 
-    def tell() -> None:
-        begun_s = time.monotonic()
-        line = ""
-        while not is_done.wait(1.0 if line else PATIENCE_S):
-            line = f"ccatp: {printable(what)}, {time.monotonic() - begun_s:.0f} s"
+    def tell(*_: object) -> None:
+        nonlocal line
+        line = f"ccatp: {printable(what)}, {time.monotonic() - begun_s:.0f} s"
+        with suppress(OSError):  # a terminal that is gone
             click.echo(f"\r{line}", nl=False, err=True)
-        if line:
-            click.echo(f"\r{' ' * len(line)}\r", nl=False, err=True)
 
-    thread = Thread(target=tell, daemon=True)
-    thread.start()
+    handler = signal.signal(signal.SIGALRM, tell)
+    timer = signal.setitimer(signal.ITIMER_REAL, PATIENCE_S, 1.0)
     try:
         yield
     finally:
-        is_done.set()
-        thread.join()
+        signal.setitimer(signal.ITIMER_REAL, *timer)
+        signal.signal(signal.SIGALRM, handler)
+        if line:
+            click.echo(f"\r{' ' * len(line)}\r", nl=False, err=True)
 
 
 def print_lines(lines: Iterable[str]) -> None:

@@ -4,6 +4,7 @@ import getpass
 import importlib.metadata
 import json
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from io import StringIO
 from pathlib import Path
@@ -384,8 +385,10 @@ def test_a_command_that_takes_long_says_so_on_a_terminal(
     screen = stream()
     monkeypatch.setattr(sys, "stderr", screen)
     monkeypatch.setattr("ccatp.cli.common.PATIENCE_S", 0.01)
+    threads = threading.active_count()
     with working("reading runs/tonight"):
         until(lambda: screen.getvalue() or not said)
+        assert threading.active_count() == threads  # beside another thread the report would not draw on two cores
     shown = "\rccatp: reading runs/tonight, 0 s"
     assert screen.getvalue().startswith(shown) is said
     assert screen.getvalue().endswith(f"\r{' ' * len(shown[1:])}\r") is said  # nothing of it is left
