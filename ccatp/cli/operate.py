@@ -126,7 +126,8 @@ def emergency(kind: str, note: str, emergency_id: uuid.UUID | None, json_output:
 def clear(emergency_id: uuid.UUID, json_output: bool, **where: Any) -> None:
     """End the emergency ID, whose cause is gone.
 
-    ID is what ccatp emergency printed. The robot must be at base or held; over TCP, our key needs the role clear.
+    ID is what ccatp emergency printed, and ccatp alarms shows. The robot must be at base or held; over TCP, our key
+    needs the role clear.
     """
     _print_reply(_ask_observatory({"cmd": "clear", "id": str(emergency_id)}, **where), json_output)
 
