@@ -1,7 +1,11 @@
-"""The study `traits`: the estimators, GTSAM's and dead reckoning on simulated runs with traits of real recordings."""
+"""The study `traits`: the estimators and dead reckoning on simulated runs with traits of real recordings.
+
+With peers each run is given to GTSAM, too, and the errors are compared in pairs.
+"""
 
 from collections.abc import Sequence
 from itertools import combinations
+from math import exp, log, sqrt
 from time import perf_counter
 from typing import Any
 
@@ -13,61 +17,85 @@ from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, run_gtsam
 from ccatp.beacons.studies.recordings import FILTERS, PEERS, EstimateError, estimate
 from ccatp.beacons.studies.trait_runs import TRAITS, trait_run
-from ccatp.filters.metrics import nees
+from ccatp.core import FloatArray
+from ccatp.filters.metrics import nees, rms
 from ccatp.missions import Part
 from ccatp.studies.campaign import Cell, Factors, Job, JobOutcome, Study
 
 PLAIN = "plain"
+_ISAM2, _BATCH = PEERS
 _INSIDE = 5.991  # chi-squared of two degrees of freedom, 95 %
+_COMPARED = ("path_m", "unaligned_m", "beacons_m")
 
 
 def run_trait(job: Job) -> JobOutcome:
-    """One estimator on one simulated run: errors, NEES, and the share of positions inside their 95 % ellipse."""
+    """One estimator on one simulated run: errors, NEES, and the share of positions inside their 95 % ellipse.
+
+    With a peer among the factors also the errors of that on the same run.
+    """
     traits, estimator = str(job.factors["traits"]), str(job.factors["estimator"])
     run = trait_run([] if traits == PLAIN else traits.split("+"), job.seed)
     begin_s = perf_counter()
     try:
         track = _track(run, job.cfg, estimator)
+        values: dict[str, Any] = {"run_s": perf_counter() - begin_s, **_errors(track, run)}
+        if (peer := job.factors.get("peer")) is not None:
+            values["peer"] = _errors(run_gtsam(run, job.cfg.csv, perf_counter)[PEERS.index(str(peer))], run)
     except (PeerGaveUp, EstimateError):
         return JobOutcome({"gave_up": True})
-    values: dict[str, Any] = {"run_s": perf_counter() - begin_s}
-    judged = judge(track, run)
-    values |= {"path_m": judged.trajectory_rmse_m, "beacons_m": judged.beacon_rmse_m}
     if estimator in FILTERS:
-        values["nees"] = None if judged.nees is None else judged.nees.mean
+        found = judge(track, run).nees
+        values["nees"] = None if found is None else found.mean
         values["covered"] = _covered(track, run)
     return JobOutcome(values)
 
 
 def _track(run: RecordedRun, cfg: RecordingsConfig, estimator: str) -> EstimatedPath:
-    if estimator in FILTERS:
-        return estimate(run, cfg, estimator)
-    if estimator in PEERS:
-        return run_gtsam(run, cfg.csv, perf_counter)[PEERS.index(estimator)]
-    return reckoned_track(run)
+    return estimate(run, cfg, estimator) if estimator in FILTERS else reckoned_track(run)
 
 
-def _covered(track: EstimatedPath, run: RecordedRun) -> float | None:
+def _off(track: EstimatedPath, run: RecordedRun) -> FloatArray:
+    """Poses minus the true ones, shape (n, 3)."""
     if run.truth is None:
-        return None
-    errors = track.poses - truth_at(run.truth, track.times_s)
-    known = np.isfinite(errors[:, 0])
-    return float(np.mean(nees(errors[known, :2], track.covariances[known, :2, :2]) < _INSIDE))
+        return np.empty((0, 3))
+    return track.poses - truth_at(run.truth, track.times_s)
+
+
+def _errors(track: EstimatedPath, run: RecordedRun) -> dict[str, float | None]:
+    """Errors of the path after one rigid alignment and without any, and of the beacons after that of the path."""
+    judged = judge(track, run)
+    off_m = np.hypot(*_off(track, run)[:, :2].T)
+    return dict(zip(_COMPARED, (judged.trajectory_rmse_m, rms(off_m), judged.beacon_rmse_m), strict=True))
+
+
+def _covered(track: EstimatedPath, run: RecordedRun) -> float:
+    off = _off(track, run)
+    known = np.isfinite(off[:, 0])
+    return float(np.mean(nees(off[known, :2], track.covariances[known, :2, :2]) < _INSIDE))
 
 
 def combine_traits(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """Medians of the errors, means of NEES and coverage, and how many estimators gave up."""
+    """Medians of the errors, means of NEES and coverage, ratios to the peer, and how many estimators gave up."""
     rows = [outcome.values for outcome in outcomes]
     values: dict[str, Any] = {"gave_up": sum("gave_up" in row for row in rows)}
-    for key, middle in (
-        ("path_m", np.median), ("beacons_m", np.median), ("nees", np.mean), ("covered", np.mean), ("run_s", np.mean),
-    ):  # fmt: skip
+    for key in (*_COMPARED, "nees", "covered", "run_s"):
         known = [row[key] for row in rows if row.get(key) is not None]
-        values[key] = float(middle(known)) if known else None
+        values[key] = float(np.median(known) if key in _COMPARED else np.mean(known)) if known else None
     largest = [row["nees"] for row in rows if row.get("nees") is not None]
     values["nees_most"] = max(largest, default=None)
     values["each_path_m"] = [row.get("path_m") for row in rows]
+    values["ratio"] = {key: _ratio(rows, key) for key in _COMPARED}
     return JobOutcome(values)
+
+
+def _ratio(rows: Sequence[Any], key: str) -> dict[str, Any]:
+    """Geometric mean of an error's ratio to that of the peer on the same run, and two standard errors about it."""
+    peers = [(row.get(key), row.get("peer", {}).get(key)) for row in rows]
+    logs = [log(own / other) for own, other in peers if own is not None and other is not None]
+    if len(logs) < 2:
+        return {"mean": None, "band": None}
+    mean, off = float(np.mean(logs)), 2.0 * float(np.std(logs, ddof=1)) / sqrt(len(logs))
+    return {"mean": exp(mean), "band": [exp(mean - off), exp(mean + off)]}
 
 
 def trait_cells(estimators: Sequence[str] = (RECKONING, *FILTERS)) -> list[Cell]:
@@ -76,12 +104,23 @@ def trait_cells(estimators: Sequence[str] = (RECKONING, *FILTERS)) -> list[Cell]
     return [Cell({"traits": name, "estimator": estimator}) for name in names for estimator in estimators]
 
 
+def _beside_peers() -> list[Cell]:
+    """The same cells, each beside GTSAM: iSAM2, or its batch for the smoother."""
+    peers = [_BATCH if cell.factors["estimator"] == "smoother" else _ISAM2 for cell in trait_cells()]
+    return [Cell({**cell.factors, "peer": peer}) for cell, peer in zip(trait_cells(), peers, strict=True)]
+
+
 STUDY = Study(
     cells=trait_cells,
-    with_peers=lambda: trait_cells((RECKONING, *FILTERS, *PEERS)),
+    with_peers=_beside_peers,
     run_job=run_trait,
     combine=combine_traits,
-    columns="path_m beacons_m nees nees_most covered gave_up run_s",
+    columns="""
+        path_m unaligned_m beacons_m nees nees_most covered gave_up run_s
+        ratio.path_m: mean band
+        ratio.unaligned_m: mean band
+        ratio.beacons_m: mean band
+    """,
     draw=lambda _cells, _out: None,
     mirrors=(),
     loader=Part("ccatp.beacons.config.load:load_recordings_config"),

@@ -4,7 +4,7 @@ import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.estimation.evaluation import RECKONING
-from ccatp.beacons.studies.traits import PLAIN, combine_traits, run_trait, trait_cells
+from ccatp.beacons.studies.traits import PLAIN, STUDY, combine_traits, run_trait, trait_cells
 from ccatp.studies.campaign import Job, JobOutcome
 
 CFG = load_recordings_config()
@@ -25,6 +25,27 @@ def test_runs_are_combined_by_the_median_and_the_largest_nees_is_kept() -> None:
     assert (found["path_m"], found["nees"], found["nees_most"], found["gave_up"]) == (1.5, 3.0, 5, 1)
     assert found["beacons_m"] is None
     assert found["each_path_m"] == [1, 2, None]
+
+
+def test_the_error_without_alignment_is_not_smaller_than_that_after_it() -> None:
+    found = run_trait(Job("traits", {"traits": PLAIN, "estimator": RECKONING}, 1, CFG)).values
+    assert found["unaligned_m"] > found["path_m"] > 0.0
+
+
+def test_the_ratio_to_the_peer_is_the_geometric_mean_over_the_runs_that_both_finished() -> None:
+    rows = [{"path_m": own, "peer": {"path_m": other}} for own, other in ((2.0, 1.0), (1.0, 2.0), (3.0, None))]
+    found = combine_traits({}, [*map(JobOutcome, rows), JobOutcome({"gave_up": True})]).values["ratio"]["path_m"]
+    assert found["mean"] == pytest.approx(1.0)
+    assert found["band"] == pytest.approx([1.0 / 4.0, 4.0])  # two standard errors, 2 ln 2
+    one = combine_traits({}, [JobOutcome(rows[0])]).values["ratio"]["path_m"]
+    assert one == {"mean": None, "band": None}
+
+
+def test_with_peers_each_estimator_stands_beside_one_of_its_kind() -> None:
+    assert STUDY.with_peers is not None
+    peers = {cell.factors["estimator"]: cell.factors["peer"] for cell in STUDY.with_peers()}
+    assert peers["fixed-lag"] == peers["ekf-slam"] == "GTSAM iSAM2"
+    assert peers["smoother"] == "GTSAM batch"
 
 
 def test_each_trait_and_each_pair_is_a_cell() -> None:
