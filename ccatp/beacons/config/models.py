@@ -526,6 +526,7 @@ class PriorsConfig(Model):
     beacon_reference_db: NonNegative
     pose_m: Positive
     heading_rad: Positive
+    core: Annotated[float, Field(gt=0.0, le=1.0)]
 
 
 class RecordingConfig(Model):

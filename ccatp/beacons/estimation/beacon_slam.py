@@ -87,7 +87,6 @@ class BeaconSlam:
         learned: innovations of the last ``observe``.
         waiting: beacons with readings that are not on the map yet, with the candidates for their places.
         levels: factor on the configured noise variance of each sensor and of the motion.
-        prior_sigmas: standard deviations of ``calibration`` before any reading, in its order.
         unplaced: number of readings with a bearing alone of a beacon that was not on the map: they are not used.
         moved: beacons that were removed to be placed again, each with the time_s of the reading that caused it.
     """
@@ -111,7 +110,6 @@ class BeaconSlam:
         self._shared = slice(v, v + len(shared))
         self._delay = v + len(shared) - 1 if delay_names else -1
         self._shown = POSE + len(shared)  # columns of a row before the beacon: pose, delay, calibration of the readings
-        self.prior_sigmas = (*own, *shared)
         self._names = (*motion.names, *models.names, *delay_names)
         self._wander = None
         if correlation_s > 0.0:

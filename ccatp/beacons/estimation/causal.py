@@ -143,10 +143,11 @@ def follow(
     ``finest_s``: steps of odometry within an interval of this length are combined, but cut at each reading.
     """
     sigmas = cfg.priors.pose_m, cfg.priors.pose_m, cfg.priors.heading_rad
-    search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, np.diag(np.square(sigmas))))
+    window = None if lag is None else Window(run, cfg, how, lag)
+    assumed = cfg if window is None else cfg.model_copy(update={"priors": window.priors})
+    search = HeadingRelocalizer(recorded_slam(assumed, how, run.first_pose, np.diag(np.square(sigmas))))
     if run.known_map is not None:
         search.best.know(run.known_map, _kinds(run))
-    window = None if lag is None else Window(run, cfg, how, lag)
     times = np.union1d(_spaced(run.steps.times_s, finest_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), list(_readings(run, cfg.radio.camera_field_rad))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
@@ -167,10 +168,12 @@ def follow(
     delayed = None if window is None else window.delayed(search.best, times, poses, covariances)
     priors, noise = (cfg.priors, None) if window is None else (window.priors, window.noise)
     path = _result(run, search.best, log, priors)
+    beyond = beyond_priors(path.calibration, cfg.priors.model_dump(), run.kind)
     found = () if window is None else window.findings()
     path = path._replace(
-        times_s=times, poses=poses, covariances=covariances, delayed=delayed, warnings=(*path.warnings, *found)
-    )
+        times_s=times, poses=poses, covariances=covariances, delayed=delayed,
+        warnings=(*path.warnings, *beyond, *found),
+    )  # fmt: skip
     return Followed(path, search.best, priors, noise)
 
 
@@ -197,7 +200,6 @@ def _result(run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig
     used = [one for one in log.learned if one.accepted]
     refused = len(log.learned) - len(used)
     nis, sizes = np.array([(one.nis, float(one.size)) for one in used]).reshape(-1, 2).T
-    priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
     # Only values that the readings have determined at least in part.
     calibration = {
         name: Calibrated(*found)
@@ -212,9 +214,7 @@ def _result(run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig
         calibration=calibration,
         refused=refused,
         updates=nis.size,
-        warnings=(
-            *_unplaced(run, slam), *beyond_priors(calibration, priors, run.kind), *_doubts(slam, nis, sizes, refused)
-        ),
+        warnings=(*_unplaced(run, slam), *_doubts(slam, nis, sizes, refused)),
         nis=nis,
         nis_sizes=sizes,
         update_s=np.array(log.update_s),

@@ -6,7 +6,8 @@ pose, calibration and beacons. What the filter alone has in its state (readings 
 relation to these.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.linalg import LinAlgError
 from ccatp.beacons.config.models import FixedLagConfig, PriorsConfig, RecordingConfig, SlamFilterConfig
 from ccatp.beacons.estimation.batch_problem import (
     BEACON,
+    CALIBRATION,
     SHARED,
     BatchProblem,
     BatchState,
@@ -40,15 +42,23 @@ REPORTED = 3.0  # readings that count as one, above which that is reported
 EARLIER_S = 2.0  # of odometry before the window, for its delay
 
 
-# Share of a calibration's prior that it has until the readings want the whole of it: the priors of a format are for
-# the worst instrument of its kind.
-NARROW = 0.5
-SURE = 1.0  # logarithm of the ratio of evidence above which they do
+FREEDOM = 8.0  # of Student's t of a calibration: one of several cores costs less than a Gaussian would take
+# Levels are left out: the spread of transmitters is no fault of an instrument.
+INSTRUMENTAL = (*CALIBRATION, "range_scale", "range_offset_m", "bearing_offset_rad")
 
 
-def narrowed(priors: PriorsConfig, wide: Collection[str]) -> PriorsConfig:
-    """Priors with a part of the standard deviation of each calibration that is not in ``wide``."""
-    return priors.model_copy(update={name: NARROW * getattr(priors, name) for name in SHARED if name not in wide})
+def reweighted(priors: PriorsConfig, squares: Mapping[str, float]) -> PriorsConfig:
+    """Gaussian priors with the weight that Student's t has at calibrations of these expected squares.
+
+    The scale of t is ``core`` times the standard deviation of the prior. The variance is (freedom scale^2 + square) /
+    (freedom + 1), with which the square of an unobserved calibration stays that of the scale.
+    """
+    sigmas = {}
+    for name in INSTRUMENTAL:
+        scale = priors.core * float(getattr(priors, name))
+        if scale > 0.0:
+            sigmas[name] = sqrt((FREEDOM * scale**2 + squares.get(name, scale**2)) / (FREEDOM + 1.0))
+    return priors.model_copy(update=sigmas)
 
 
 class _Solved(NamedTuple):
@@ -77,7 +87,7 @@ class Window:
         self._seen: tuple[object, ...] = (0, 0)
         self.noise = BeaconNoise.configured(len(run.beacon_ids))
         self._places = None if run.known_map is None else PlacePrior.of_run(run, run.beacon_ids)
-        self._wide, self._cfg = cfg.priors, cfg.model_copy(update={"priors": narrowed(cfg.priors, ())})
+        self._configured, self._cfg = cfg.priors, cfg.model_copy(update={"priors": reweighted(cfg.priors, {})})
         self._due_s, self._placed = self._begin_s, frozenset[str]()
         self._delayed = list[tuple[float, FloatArray, FloatArray]]()
 
@@ -114,7 +124,7 @@ class Window:
             slam.join(name, solved.state.beacons[self._run.beacon_ids.index(str(name)), :2])
         self._last = solved
         self._correct(slam, solved, time_s)
-        self._widen(solved)
+        self._reweight(solved)
         self.noise = range_noise(solved.problem, solved.state)
         for k, name in enumerate(self._run.beacon_ids):
             slam.take_noise(name, *(float(column[k]) for column in (self.noise.variance, *self.noise[2:])))
@@ -140,8 +150,8 @@ class Window:
 
     @property
     def priors(self) -> PriorsConfig:
-        """The priors in use: narrow where the readings do not want the whole one; as configured before a solution."""
-        return self._wide if self._last is None else self._cfg.priors
+        """The priors in use: Gaussian, with the weights of Student's t at the calibration of the last solution."""
+        return self._cfg.priors
 
     def findings(self) -> Iterator[str]:
         """What was found of the noise, and what was done about it."""
@@ -223,26 +233,13 @@ class Window:
         values = np.concatenate([solved.state.poses[-1], solved.state.shared, solved.state.beacons.ravel()])
         slam.replace(time_s, names, [self._run.beacon_ids[k] for k in placed], values[rows], whole[np.ix_(rows, rows)])
 
-    def _widen(self, solved: _Solved) -> None:
-        """Give a calibration its whole prior if the readings want that, else a narrow one.
-
-        With z what the readings alone tell of it, and 1 / I their variance, the evidence for a prior of the standard
-        deviation s is N(z; 0, s^2 + 1 / I). Where the readings tell little, both are the same, and it stays narrow.
-        """
-        problem, shared = solved.problem, np.flatnonzero(solved.problem.free[: len(SHARED)]).tolist()
-        variances = np.diag(solved.factored.shared_covariance())
-        wide = list[str]()
-        for at, k in enumerate(shared):
-            information = 1.0 / variances[at] - problem.assumed_information[k]
-            sigma = float(getattr(self._wide, SHARED[k]))
-            if information * sigma * sigma < 1.0:
-                continue
-            z = float(solved.state.shared[k]) / float(variances[at] * information)
-            spreads = np.array((sigma, NARROW * sigma)) ** 2 + 1.0 / information
-            whole, little = (-0.5 * (np.log(spreads) + z * z / spreads)).tolist()
-            if whole > little + SURE:
-                wide.append(SHARED[k])
-        self._cfg = self._cfg.model_copy(update={"priors": narrowed(self._wide, wide)})
+    def _reweight(self, solved: _Solved) -> None:
+        """Give the prior of each calibration its weight at this solution."""
+        free = np.flatnonzero(solved.problem.free[: len(SHARED)])
+        variances = solved.factored.shared_covariance().diagonal()[: free.size]
+        squares = (solved.state.shared[free] ** 2 + variances).tolist()
+        priors = reweighted(self._configured, dict(zip([SHARED[k] for k in free], squares, strict=True)))
+        self._cfg = self._cfg.model_copy(update={"priors": priors})
 
     def _marginalise(self, before_s: float) -> None:
         """Keep what the readings up to a pose of the window tell as a prior, and begin there."""

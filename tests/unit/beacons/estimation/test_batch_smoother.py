@@ -45,11 +45,13 @@ RADIO = RadioNoiseConfig(
     range_sigma_m=0.1, range_sigma_per_m=0.02, camera_field_rad=0.0, bearing_sigma_rad=0.03, rssi_sigma_db=3.0,
     rssi_reference_dbm=-40.0, rssi_exponent=2.2, freedom=5.0, correlation_s=0.0, gate_sigmas=5.0,
 )  # fmt: skip
-NO_PRIORS = PriorsConfig(**dict.fromkeys(PriorsConfig.model_fields, 0.0) | {"pose_m": 0.05, "heading_rad": 0.03})
+NO_PRIORS = PriorsConfig(
+    **dict.fromkeys(PriorsConfig.model_fields, 0.0) | {"pose_m": 0.05, "heading_rad": 0.03, "core": 0.5}
+)
 PRIORS = PriorsConfig(
     distance_scale=0.1, distance_per_rad=0.05, turn_scale=0.1, turn_per_m=0.05, turn_bias_rad_s=0.02,
     odometry_delay_s=0.2, range_scale=0.1, range_offset_m=0.3, bearing_offset_rad=0.02, rssi_reference_db=5.0,
-    rssi_exponent=0.4, beacon_offset_m=0.1, beacon_reference_db=2.0, pose_m=0.05, heading_rad=0.03,
+    rssi_exponent=0.4, beacon_offset_m=0.1, beacon_reference_db=2.0, pose_m=0.05, heading_rad=0.03, core=0.5,
 )  # fmt: skip
 OF_PROBLEM = RecordingConfig(odometry=ODOMETRY, radio=RADIO, priors=PRIORS)
 

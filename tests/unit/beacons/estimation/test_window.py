@@ -14,6 +14,7 @@ from ccatp.beacons.estimation.evaluation import judge
 from ccatp.beacons.estimation.least_squares import Factored, eliminated
 from ccatp.beacons.estimation.range_noise import correlations, readings_as_one
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
+from ccatp.beacons.estimation.window import reweighted
 from ccatp.beacons.filters.ekf_slam import EkfSlam
 from ccatp.beacons.studies.trait_runs import trait_run
 from ccatp.core import FloatArray
@@ -87,7 +88,7 @@ def test_it_is_consistent_where_errors_last_and_says_that_they_do() -> None:
     assert any("range errors of beacon" in line for line in track.warnings)
 
 
-def test_a_calibration_has_its_whole_prior_only_if_the_readings_want_it() -> None:
+def test_a_calibration_far_from_zero_is_found_and_one_near_zero_stays_there() -> None:
     run = recorded(world(3, 90.0), bearings=False)
     scaled = replace(run, readings=run.readings._replace(range_m=1.08 * run.readings.range_m))
     given = Settings(CONFIG.csv, CONFIG.filter)
@@ -95,6 +96,34 @@ def test_a_calibration_has_its_whole_prior_only_if_the_readings_want_it() -> Non
     assert abs(sure.value) < 0.02
     assert sure.sigma < 0.02
     assert free.value == pytest.approx(0.08, abs=3.0 * free.sigma)
+
+
+def test_good_instruments_lose_little_by_being_calibrated() -> None:
+    none = CONFIG.csv.priors.model_copy(update=dict.fromkeys(SHARED, 0.0))
+    by_none = Settings(CONFIG.csv.model_copy(update={"priors": none}), CONFIG.filter)
+    ratios = []
+    for seed in (1, 4, 6):
+        run = trait_run((), seed)
+        own, other = (
+            judge(estimated(run, given, CONFIG.fixed_lag), run).trajectory_rmse_m
+            for given in (Settings(CONFIG.csv, CONFIG.filter), by_none)
+        )
+        assert own is not None
+        assert other is not None
+        ratios.append(own / other)
+    assert np.exp(np.mean(np.log(ratios))) < 1.35  # 1.6 with half of each prior, until the evidence is for the whole
+
+
+def test_a_prior_has_the_weight_of_student_s_t() -> None:
+    """Its width grows with the calibration without a step, and without any reading it is that of the core."""
+    priors = CONFIG.csv.priors
+    core = priors.core * priors.range_scale
+    widths = [reweighted(priors, {"range_scale": (k * core) ** 2}).range_scale for k in range(41)]
+    assert reweighted(priors, {}).range_scale == pytest.approx(core)
+    assert widths[1] == pytest.approx(core)
+    assert np.all(np.diff(widths) > 0.0)
+    assert np.all(np.diff(widths) < 0.5 * core)
+    assert reweighted(priors, {}).rssi_reference_db == priors.rssi_reference_db
 
 
 # -- its parts --------------------------------------------------------------------------------------------------------
