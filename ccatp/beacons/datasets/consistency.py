@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import minimize
 
 from ccatp.beacons.datasets.tables import instant
 from ccatp.beacons.datasets.trajectory import CONSTANT_RAD, STRAIGHT
@@ -13,6 +14,7 @@ from ccatp.beacons.estimation.recording import (
     RecordedRun,
     ReferencePath,
     Steps,
+    antenna_path,
     dead_reckoned,
     running_total,
 )
@@ -38,6 +40,9 @@ FINE_S = np.arange(-0.5, 0.501, 0.05)
 LEAST_LAG_S = 0.6  # smaller ones are the delay that the estimators calibrate: two sigmas of its widest prior
 BETTER = 0.6  # of the misfit that remains with a lag, or in another unit
 MAJORITY = 0.65  # of the windows fit better
+FIRST_ARM_M, FINE_ARM_M, MOST_TRIES = 0.3, 0.01, 80  # of the search for the place of a radio on the vehicle
+LEAST_ARM_M, MOST_ARM_M = 0.15, 10.0  # above the error of the ranges, and as long as vehicles are
+CLEARLY = 0.9  # of the misfit that remains with another clock
 FARTHEST = 5.0  # windows beyond this many usual misfits count as that
 DEGREES = np.pi / 180.0
 LEAST_TURN_RAD = 3.0
@@ -225,6 +230,9 @@ def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
     if windows.count < LEAST_GROUPS:
         return
     times_s = run.steps.times_s
+    if off := _radio_off_the_origin(windows, times_s, path):
+        yield off
+        return
     middle_s = float(np.median(windows.begin_s))
     parts = [np.ones(windows.count, dtype=bool), windows.begin_s < middle_s, windows.begin_s >= middle_s]
     lags = _lags(lambda lag_s: windows.misfits(times_s, path, lag_s), parts)
@@ -244,6 +252,33 @@ def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
             other = dead_reckoned(run.steps._replace(turn_rad=factor * run.steps.turn_rad), (0.0, 0.0, 0.0))
             if _is_better(windows.misfits(times_s, path), windows.misfits(times_s, other)):
                 yield f"ranges fit an odometry that turns {factor:.3g} times as much: are its turns in {what}?"
+
+
+def _radio_off_the_origin(windows: _Windows, times_s: FloatArray, path: FloatArray) -> str:
+    """A warning if ranges fit far better to a radio ahead or beside of where it should be, and better than with a lag.
+
+    On a straight way a radio ahead is like a clock that is late; in turns the two differ.
+    """
+
+    def misfits(arm_m: FloatArray) -> FloatArray:
+        ahead_m, left_m = arm_m.tolist()
+        return windows.misfits(times_s, np.column_stack([antenna_path(path, (ahead_m, left_m)), path[:, 2]]))
+
+    now = windows.misfits(times_s, path)
+    start = np.array([[0.0, 0.0], [FIRST_ARM_M, 0.0], [0.0, FIRST_ARM_M]])
+    options = {"initial_simplex": start, "xatol": FINE_ARM_M, "fatol": 1e-6, "maxfev": MOST_TRIES}
+    arm_m = minimize(lambda at: _typical(misfits(at), now), start[0], method="Nelder-Mead", options=options).x
+    best, far_m = misfits(arm_m), float(np.hypot(*arm_m))
+    if not LEAST_ARM_M <= far_m <= MOST_ARM_M or not _is_better(now, best):
+        return ""
+    lagged = min(_typical(windows.misfits(times_s, path, float(lag_s)), now) for lag_s in LAGS_S)
+    if _typical(best, now) > CLEARLY * lagged:
+        return ""
+    ahead_m, left_m = arm_m.tolist()
+    return (
+        f"ranges fit the odometry best for a radio {abs(ahead_m):.2g} m {'ahead' if ahead_m > 0.0 else 'behind'} and "
+        f"{abs(left_m):.2g} m to the {'left' if left_m > 0.0 else 'right'} of where it is taken to be: give its place"
+    )
 
 
 def _shifted(lag_s: float) -> str:

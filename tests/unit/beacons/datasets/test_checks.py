@@ -1,5 +1,6 @@
 """What looks wrong in a set is told; what is sound is not."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,14 @@ from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.datasets.checks import sudden_disagreement, survey_doubts, suspicions
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.estimation.causal import filter_run
-from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, RecordedRun, ReferencePath, Steps
+from ccatp.beacons.estimation.recording import (
+    BeaconFix,
+    EstimatedPath,
+    RecordedRun,
+    ReferencePath,
+    Steps,
+    antenna_path,
+)
 from tests.unit.beacons.datasets.sets import (
     BEACONS,
     labyrinth_lines,
@@ -221,3 +229,21 @@ def test_a_sound_run_and_one_beacon_alone_that_is_off_are_no_move() -> None:
     assert not said_on_the_way(SOUND)
     hidden = (READ.beacon == 1) & (READ.times_s > 60.0) & (READ.times_s < 75.0)
     assert not said_on_the_way(with_readings(range_m=READ.range_m + 2.0 * hidden))
+
+
+@pytest.mark.parametrize(
+    ("arm_m", "what"),
+    [((0.6, -0.3), ("ahead", "right")), ((-0.5, 0.4), ("behind", "left")), ((0.02, 0.0), ())],
+)
+def test_a_radio_off_the_origin_is_no_other_clock(arm_m: tuple[float, float], what: tuple[str, ...]) -> None:
+    at = antenna_path(POSES.T, arm_m)
+    places = np.array(list(BEACONS.values()))[READ.beacon]
+    noise_m = 0.05 * np.random.default_rng(4).standard_normal(READ.range_m.size)
+    run = with_readings(range_m=np.hypot(*(places - at).T) + noise_m, bearing_rad=np.full(READ.range_m.size, np.nan))
+    said = [line for line in suspicions(run) if "fit the odometry" in line]
+    assert len(said) == bool(what)
+    assert not any("clock" in line for line in said)
+    for line in said:
+        assert all(word in line for word in what)
+        sizes_m = [float(size) for size in re.findall(r"[\d.]+(?= m )", line)]
+        assert sizes_m == pytest.approx(np.abs(arm_m), abs=0.05)  # sigma of a range
