@@ -1,17 +1,14 @@
 """Warnings about a recorded run: units, gaps, readings and odometry against truth and survey."""
 
-from collections.abc import Generator, Iterator, Mapping
-from itertools import combinations
+from collections.abc import Generator, Iterator
 
 import numpy as np
 import numpy.typing as npt
 
-from ccatp.beacons.cricket.map_fit import map_rms_m
 from ccatp.beacons.datasets.consistency import inconsistencies
 from ccatp.beacons.datasets.tables import GAP_S, instant, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor
-from ccatp.beacons.estimation.recording import EstimatedPath, Readings, RecordedRun, ReferencePath, Steps
-from ccatp.beacons.rigid_motion import aligned_rms_m
+from ccatp.beacons.estimation.recording import Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray
 
 MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
@@ -340,79 +337,3 @@ def _map_of(run: RecordedRun) -> Iterator[str]:
     unread = [name for name in run.beacon_truth_m if name not in run.beacon_ids]
     if unread:
         yield f"surveyed beacons without any reading: {', '.join(unread)}"
-
-
-MISSED = 5.0  # times the expected difference of map and survey, above which one of them is wrong
-MENDED = 0.3  # a changed position explains the difference if at most this share of it remains
-
-
-def survey_doubts(track: EstimatedPath, surveyed_m: Mapping[str, tuple[float, float]]) -> list[str]:
-    """A warning of two exchanged beacons or one moved beacon in the survey, if the map fits far better without.
-
-    Otherwise a warning if map and survey differ by more than the covariance of the map explains. For runs without a
-    reference trajectory, which have no other check. Map and survey may be in different frames.
-    """
-    names = [name for name in track.beacons if name in surveyed_m]
-    if len(names) < 4:  # three positions fit any three others too well
-        return []
-    found = np.array([track.beacons[name][:2] for name in names])
-    surveyed = np.array([surveyed_m[name] for name in names])
-    miss_m = aligned_rms_m(found, surveyed)
-    if miss_m < STRANGER_M:
-        return []
-    fits_m: dict[str, float] = {}
-    every = np.arange(len(names))
-    for a, b in combinations(range(len(names)), 2):
-        order = every.copy()
-        order[[a, b]] = b, a
-        line = f"beacons {names[a]} and {names[b]} look exchanged in the survey"
-        fits_m[line] = aligned_rms_m(found, surveyed[order])
-    for k, name in enumerate(names):
-        line = f"beacon {name} was moved, or surveyed wrongly"
-        fits_m[line] = aligned_rms_m(found[every != k], surveyed[every != k])
-    mirrored = "the map is the mirror image of the survey (turns of the odometry, or its y, have the other sign)"
-    fits_m[mirrored] = aligned_rms_m(found, surveyed * (1.0, -1.0))
-    line, fit_m = min(fits_m.items(), key=lambda item: item[1])
-    if fit_m > MENDED * miss_m:
-        rows, places = [list(track.beacons).index(name) for name in names], list(track.beacons.values())
-        of_all = np.array([place[:2] for place in places])
-        expected_m = map_rms_m(track.map_covariance, of_all, rows, aligned=True)
-        wrong = (
-            f"the map misses the survey by {miss_m:.2g} m, where {expected_m:.2g} m are expected: one of them is wrong"
-        )
-        return [wrong] if miss_m > MISSED * expected_m else []
-    return [f"{line}: the map misses the survey by {miss_m:.2g} m, else by {fit_m:.2g} m"]
-
-
-TOGETHER_S = 5.0  # readings within this time are looked at together,
-LEAST_TOGETHER = 8  # if there are as many, of two beacons
-# Mean NIS per degree of freedom of the better half of the beacons, above which all are off: with two beacons of two
-# degrees of freedom, by chance once in half a million.
-SUDDEN = 8.0
-
-
-def sudden_disagreement(track: EstimatedPath) -> list[str]:
-    """A warning if the readings of several beacons at once are far from what the filter expects.
-
-    Outliers, reflections and a moved beacon are off alone; a vehicle that was moved, or whose clock was set, sees all
-    beacons elsewhere.
-    """
-    found = track.innovations
-    if not found:
-        return []
-    times_s = np.array([one.time_s for one in found])
-    nis = np.array([one.nis / one.size for one in found])
-    _, beacon = np.unique([one.beacon for one in found], return_inverse=True)
-    worst, at_s = 0.0, 0.0
-    for begin_s in np.arange(times_s[0], times_s[-1], 0.2 * TOGETHER_S).tolist():
-        rows = slice(*np.searchsorted(times_s, (begin_s, begin_s + TOGETHER_S)))
-        counts = np.bincount(beacon[rows])
-        means = np.sort(np.bincount(beacon[rows], nis[rows])[counts > 0] / counts[counts > 0])
-        if means.size > 1 and counts.sum() >= LEAST_TOGETHER and means[(means.size - 1) // 2] > worst:
-            worst, at_s = float(means[(means.size - 1) // 2]), begin_s
-    if worst < SUDDEN:
-        return []
-    return [
-        f"readings of several beacons at once are off, at {instant(at_s)} by {worst:.3g} times their expected squares: "
-        "was the vehicle moved, or a clock set?"
-    ]

@@ -15,7 +15,7 @@ import numpy as np
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.cricket.measured_map import map_measured
-from ccatp.beacons.datasets.checks import sudden_disagreement, survey_doubts
+from ccatp.beacons.datasets.doubts import map_doubts, sudden_disagreement, survey_doubts
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
 from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
 from ccatp.beacons.estimation.causal import filter_run
@@ -59,7 +59,9 @@ def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> E
         raise EstimateError(
             f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"
         ) from error
-    surveyed = survey_doubts(track, run.beacon_truth_m) if run.truth is None else ()
+    surveyed = survey_doubts(track, run.beacon_truth_m) if run.truth is None else []
+    if run.known_map is not None:
+        surveyed += map_doubts(track, run.known_map)
     doubts = prediction_doubts(predicted(run, track, cfg.radio.camera_field_rad))
     return track._replace(warnings=(*track.warnings, *sudden_disagreement(track), *surveyed, *doubts))
 

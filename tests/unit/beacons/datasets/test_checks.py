@@ -7,13 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.beacons.config.load import load_recordings_config
-from ccatp.beacons.datasets.checks import sudden_disagreement, survey_doubts, suspicions
+from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.reader import read_run
-from ccatp.beacons.estimation.causal import filter_run
 from ccatp.beacons.estimation.recording import (
-    BeaconFix,
-    EstimatedPath,
     RecordedRun,
     ReferencePath,
     Steps,
@@ -173,62 +169,6 @@ def test_labyrinth_wheel_columns_are_reported_and_compared_with_the_true_path(tm
     reported = " | ".join(run.warnings)
     assert "read as left, right and half the track of 0.3 m" in reported
     assert ("turns the other way" in reported) is exchanged
-
-
-TURN = np.array([[0.8, -0.6], [0.6, 0.8]])
-
-
-def mapped(names: str = "6789", sigma_m: float = 0.05) -> EstimatedPath:
-    """A map in a frame of its own, with errors of centimetres."""
-    places = {name: TURN @ place + 0.05 * k for k, (name, place) in enumerate(BEACONS.items()) if name in names}
-    fixes = {
-        name: BeaconFix(float(place[0]), float(place[1]), sigma_m**2 * np.eye(2)) for name, place in places.items()
-    }
-    at_all = sigma_m**2 * np.eye(2 * len(fixes))
-    return EstimatedPath(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)), fixes, {}, 0, 0, (), map_covariance=at_all)
-
-
-@pytest.mark.parametrize(
-    ("survey", "what"),
-    [
-        ({}, ""),
-        ({"6": BEACONS["8"], "8": BEACONS["6"]}, "beacons 6 and 8 look exchanged in the survey: the map misses"),
-        ({"7": (9.5, 8.5)}, "beacon 7 was moved, or surveyed wrongly: the map misses the survey by 1"),
-        ({name: (y, x) for name, (x, y) in BEACONS.items()}, "the map is the mirror image of the survey (turns of"),
-        ({"6": (3.0, 9.0), "7": (0.0, -3.0)}, "are expected: one of them is wrong"),  # neither makes it fit
-    ],
-)
-def test_a_map_shows_errors_of_the_survey(survey: dict[str, tuple[float, float]], what: str) -> None:
-    lines = survey_doubts(mapped(), {**BEACONS, **survey})
-    assert len(lines) == bool(what)
-    assert what in " ".join(lines)
-    assert survey_doubts(mapped("678"), {**BEACONS, **survey}) == []
-
-
-def test_a_vague_map_may_miss_the_survey() -> None:
-    assert survey_doubts(mapped(sigma_m=2.0), {**BEACONS, "6": (3.0, 9.0), "7": (0.0, -3.0)}) == []
-
-
-def said_on_the_way(run: RecordedRun) -> list[str]:
-    cfg = load_recordings_config()
-    return sudden_disagreement(filter_run(run, cfg.csv, cfg.filter, lambda: 0.0))
-
-
-def test_a_vehicle_that_was_moved_sees_all_beacons_elsewhere() -> None:
-    away = (W.times_s[:-1] >= 60.0) & (W.times_s[:-1] < 75.0)
-    steps = SOUND.steps._replace(
-        distance_m=np.where(away, 0.0, SOUND.steps.distance_m), turn_rad=np.where(away, 0.0, SOUND.steps.turn_rad)
-    )
-    seen = READ.where((READ.times_s < 60.0) | (READ.times_s > 75.0))
-    (line,) = said_on_the_way(replace(SOUND, steps=steps, readings=seen))
-    assert "readings of several beacons at once are off, at 7" in line
-    assert "was the vehicle moved, or a clock set?" in line
-
-
-def test_a_sound_run_and_one_beacon_alone_that_is_off_are_no_move() -> None:
-    assert not said_on_the_way(SOUND)
-    hidden = (READ.beacon == 1) & (READ.times_s > 60.0) & (READ.times_s < 75.0)
-    assert not said_on_the_way(with_readings(range_m=READ.range_m + 2.0 * hidden))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,151 @@
+"""Warnings about an estimate: a survey or a known map that it contradicts, readings that are off all at once."""
+
+from collections.abc import Iterator, Mapping
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import binom, chi2
+
+from ccatp.beacons.cricket.map_fit import map_rms_m
+from ccatp.beacons.datasets.checks import STRANGER_M
+from ccatp.beacons.datasets.tables import instant
+from ccatp.beacons.estimation.recording import EstimatedPath, KnownMap
+from ccatp.beacons.rigid_motion import aligned_rms_m
+
+MISSED = 5.0  # times the expected difference of map and survey, above which one of them is wrong
+MENDED = 0.3  # a changed position explains the difference if at most this share of it remains
+
+
+def survey_doubts(track: EstimatedPath, surveyed_m: Mapping[str, tuple[float, float]]) -> list[str]:
+    """A warning of two exchanged beacons or one moved beacon in the survey, if the map fits far better without.
+
+    Otherwise a warning if map and survey differ by more than the covariance of the map explains. For runs without a
+    reference trajectory, which have no other check. Map and survey may be in different frames.
+    """
+    names = [name for name in track.beacons if name in surveyed_m]
+    if len(names) < 4:  # three positions fit any three others too well
+        return []
+    found = np.array([track.beacons[name][:2] for name in names])
+    surveyed = np.array([surveyed_m[name] for name in names])
+    miss_m = aligned_rms_m(found, surveyed)
+    if miss_m < STRANGER_M:
+        return []
+    fits_m: dict[str, float] = {}
+    every = np.arange(len(names))
+    for a, b in combinations(range(len(names)), 2):
+        order = every.copy()
+        order[[a, b]] = b, a
+        line = f"beacons {names[a]} and {names[b]} look exchanged in the survey"
+        fits_m[line] = aligned_rms_m(found, surveyed[order])
+    for k, name in enumerate(names):
+        line = f"beacon {name} was moved, or surveyed wrongly"
+        fits_m[line] = aligned_rms_m(found[every != k], surveyed[every != k])
+    mirrored = "the map is the mirror image of the survey (turns of the odometry, or its y, have the other sign)"
+    fits_m[mirrored] = aligned_rms_m(found, surveyed * (1.0, -1.0))
+    line, fit_m = min(fits_m.items(), key=lambda item: item[1])
+    if fit_m > MENDED * miss_m:
+        rows, places = [list(track.beacons).index(name) for name in names], list(track.beacons.values())
+        of_all = np.array([place[:2] for place in places])
+        expected_m = map_rms_m(track.map_covariance, of_all, rows, aligned=True)
+        wrong = (
+            f"the map misses the survey by {miss_m:.2g} m, where {expected_m:.2g} m are expected: one of them is wrong"
+        )
+        return [wrong] if miss_m > MISSED * expected_m else []
+    return [f"{line}: the map misses the survey by {miss_m:.2g} m, else by {fit_m:.2g} m"]
+
+
+SEEN = 0.1  # share of the variance of a known place that the readings take away, from which they have seen it
+DOUBTED = 0.99  # chi-squared of known places, above which they are doubted
+
+
+def map_doubts(track: EstimatedPath, known_map: KnownMap) -> list[str]:
+    """A warning if the readings move the known places by more than the covariance of the map allows.
+
+    A correct map moves by d with the covariance P0 - P1, before and after the readings. Directions of which the
+    readings say little are left out.
+    """
+    names = [name for name in known_map.names if name in track.beacons]
+    if not names or not track.map_covariance.size:
+        return []
+    every = list(track.beacons)
+    at = [2 * every.index(name) + axis for name in names for axis in range(2)]
+    before, after = known_map.of(names), track.map_covariance[np.ix_(at, at)]
+    moved_m = np.array([track.beacons[name][:2] for name in names]) - before.places_m
+    root = np.linalg.inv(np.linalg.cholesky(before.covariance_m2))
+    share, turn = np.linalg.eigh(np.eye(len(at)) - root @ after @ root.T)
+    d = turn.T @ root @ moved_m.ravel()
+    seen = share > SEEN
+    squares, count = float(np.sum(d[seen] ** 2 / share[seen])), int(seen.sum())
+    if not count or chi2.cdf(squares, count) < DOUBTED:
+        return []
+    ratio = float(np.sqrt(squares / count))
+    usual_m = float(np.sqrt(np.mean(before.covariance_m2.diagonal())))
+    return [
+        f"the readings move the known places {ratio:.2g} times as far as their standard deviations of {usual_m:.2g} m "
+        f"allow, so those of the path are too small as well: about {ratio * usual_m:.2g} m would fit"
+    ]
+
+
+TOGETHER_S = 5.0  # readings within this time are looked at together,
+LEAST_TOGETHER = 8  # if there are as many, of two beacons
+# Mean NIS per degree of freedom of the better half of the beacons, above which all are off: with two beacons of two
+# degrees of freedom, by chance once in half a million.
+SUDDEN = 8.0
+OFF = 25.0  # median of one beacon: five standard deviations
+SELDOM = 0.1  # number of times that so many beacons would be off at once in the run, if it were by chance
+
+
+class _Together(NamedTuple):
+    """Readings within ``TOGETHER_S`` from a time on."""
+
+    begin_s: float
+    readings: int
+    beacons: int
+    better_half: float  # mean NIS per degree of freedom of the worst beacon of the better half
+    off: int  # beacons whose median is beyond ``OFF``
+
+
+def sudden_disagreement(track: EstimatedPath) -> list[str]:
+    """A warning if the readings of several beacons at once are far from what the filter expects.
+
+    Outliers, reflections and a moved beacon are off alone; a vehicle that was moved, or whose clock was set, sees all
+    beacons elsewhere, or those that it had seen before while new ones were placed.
+    """
+    groups = list(_together(track))
+    several = [one for one in groups if one.beacons > 1 and one.readings >= LEAST_TOGETHER]
+    worst = max(several, key=lambda one: one.better_half, default=None)
+    asks = "was the vehicle moved, or a clock set?"
+    if worst is not None and worst.better_half >= SUDDEN:
+        return [
+            f"readings of several beacons at once are off, at {instant(worst.begin_s)} by {worst.better_half:.3g} "
+            f"times their expected squares: {asks}"
+        ]
+    chances = [(_chance(one, groups), k) for k, one in enumerate(groups) if one.off > 1]
+    chance, k = min(chances, default=(1.0, 0))
+    if chance > SELDOM:
+        return []
+    where = f"at {instant(groups[k].begin_s)}"
+    return [f"readings of {groups[k].off} of {groups[k].beacons} beacons are off at once, {where}, seldom else: {asks}"]
+
+
+def _together(track: EstimatedPath) -> Iterator[_Together]:
+    found = track.innovations
+    times_s = np.array([one.time_s for one in found])
+    nis = np.array([one.nis / one.size for one in found])
+    _, beacon = np.unique([one.beacon for one in found], return_inverse=True)
+    for begin_s in np.arange(times_s[0], times_s[-1], 0.2 * TOGETHER_S).tolist() if found else ():
+        rows = slice(*np.searchsorted(times_s, (begin_s, begin_s + TOGETHER_S)))
+        by_beacon = [nis[rows][beacon[rows] == one] for one in np.unique(beacon[rows])]
+        if by_beacon:
+            means = sorted(float(one.mean()) for one in by_beacon)
+            off = sum(float(np.median(one)) > OFF for one in by_beacon)
+            yield _Together(begin_s, rows.stop - rows.start, len(means), means[(len(means) - 1) // 2], off)
+
+
+def _chance(group: _Together, groups: list[_Together]) -> float:
+    """Expected number of groups with as many beacons off, if each is off as often as in the rest of the run."""
+    others = [one for one in groups if abs(one.begin_s - group.begin_s) >= TOGETHER_S]
+    overlap = len(groups) / max(len({int(one.begin_s // TOGETHER_S) for one in groups}), 1)
+    share = (sum(one.off for one in others) / overlap + 1.0) / (sum(one.beacons for one in others) / overlap + 2.0)
+    return float(binom.sf(group.off - 1, group.beacons, share)) * len(groups) / overlap

@@ -1,0 +1,121 @@
+"""Warnings about an estimate: surveys and maps that it contradicts, and readings that are off all at once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.config.load import load_recordings_config
+from ccatp.beacons.datasets.doubts import map_doubts, sudden_disagreement, survey_doubts
+from ccatp.beacons.estimation.causal import filter_run
+from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, KnownMap, ReadingInnovation, RecordedRun
+from tests.unit.beacons.datasets.sets import BEACONS, recorded, world
+
+W = world(seconds=120.0)
+SOUND = recorded(W)
+READ = SOUND.readings
+TURN = np.array([[0.8, -0.6], [0.6, 0.8]])
+
+
+def mapped(names: str = "6789", sigma_m: float = 0.05) -> EstimatedPath:
+    """A map in a frame of its own, with errors of centimetres."""
+    places = {name: TURN @ place + 0.05 * k for k, (name, place) in enumerate(BEACONS.items()) if name in names}
+    fixes = {
+        name: BeaconFix(float(place[0]), float(place[1]), sigma_m**2 * np.eye(2)) for name, place in places.items()
+    }
+    at_all = sigma_m**2 * np.eye(2 * len(fixes))
+    return EstimatedPath(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)), fixes, {}, 0, 0, (), map_covariance=at_all)
+
+
+@pytest.mark.parametrize(
+    ("survey", "what"),
+    [
+        ({}, ""),
+        ({"6": BEACONS["8"], "8": BEACONS["6"]}, "beacons 6 and 8 look exchanged in the survey: the map misses"),
+        ({"7": (9.5, 8.5)}, "beacon 7 was moved, or surveyed wrongly: the map misses the survey by 1"),
+        ({name: (y, x) for name, (x, y) in BEACONS.items()}, "the map is the mirror image of the survey (turns of"),
+        ({"6": (3.0, 9.0), "7": (0.0, -3.0)}, "are expected: one of them is wrong"),  # neither makes it fit
+    ],
+)
+def test_a_map_shows_errors_of_the_survey(survey: dict[str, tuple[float, float]], what: str) -> None:
+    lines = survey_doubts(mapped(), {**BEACONS, **survey})
+    assert len(lines) == bool(what)
+    assert what in " ".join(lines)
+    assert survey_doubts(mapped("678"), {**BEACONS, **survey}) == []
+
+
+def test_a_vague_map_may_miss_the_survey() -> None:
+    assert survey_doubts(mapped(sigma_m=2.0), {**BEACONS, "6": (3.0, 9.0), "7": (0.0, -3.0)}) == []
+
+
+def said_on_the_way(run: RecordedRun) -> list[str]:
+    cfg = load_recordings_config()
+    return sudden_disagreement(filter_run(run, cfg.csv, cfg.filter, lambda: 0.0))
+
+
+def test_a_vehicle_that_was_moved_sees_all_beacons_elsewhere() -> None:
+    away = (W.times_s[:-1] >= 60.0) & (W.times_s[:-1] < 75.0)
+    steps = SOUND.steps._replace(
+        distance_m=np.where(away, 0.0, SOUND.steps.distance_m), turn_rad=np.where(away, 0.0, SOUND.steps.turn_rad)
+    )
+    seen = READ.where((READ.times_s < 60.0) | (READ.times_s > 75.0))
+    (line,) = said_on_the_way(replace(SOUND, steps=steps, readings=seen))
+    assert "readings of several beacons at once are off, at 7" in line
+    assert "was the vehicle moved, or a clock set?" in line
+
+
+def test_a_sound_run_and_one_beacon_alone_that_is_off_are_no_move() -> None:
+    assert not said_on_the_way(SOUND)
+    hidden = (READ.beacon == 1) & (READ.times_s > 60.0) & (READ.times_s < 75.0)
+    assert not said_on_the_way(replace(SOUND, readings=READ._replace(range_m=READ.range_m + 2.0 * hidden)))
+
+
+@pytest.mark.parametrize(("sigmas", "is_doubted"), [(1.0, False), (3.0, True)])
+def test_a_map_that_the_readings_move_too_far_is_doubted(sigmas: float, is_doubted: bool) -> None:
+    before, after = 0.02**2 * np.eye(8), 0.01**2 * np.eye(8)
+    known = KnownMap(tuple(BEACONS), np.array(list(BEACONS.values())), before, np.full(4, np.nan))
+    moves_m = sigmas * np.sqrt(0.02**2 - 0.01**2) * np.array([[1, -1], [-1, 1], [1, 1], [-1, -1]])
+    places = zip(BEACONS, known.places_m + moves_m, strict=True)
+    fixes = {name: BeaconFix(float(place[0]), float(place[1]), after[:2, :2]) for name, place in places}
+    track = track_of(fixes, after)
+    said = map_doubts(track, known)
+    assert bool(said) == is_doubted
+    if said:
+        assert "known places 3 times as far as their standard deviations of 0.02 m allow" in said[0]
+        assert "about 0.06 m would fit" in said[0]
+    assert map_doubts(track_of(fixes, before), known) == []  # readings that say nothing of the places
+    assert map_doubts(track_of({}, np.zeros((0, 0))), known) == []
+
+
+def track_of(fixes: dict[str, BeaconFix], covariance: np.ndarray) -> EstimatedPath:
+    """A track of which only the map matters."""
+    nothing = np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3))
+    return EstimatedPath(*nothing, fixes, {}, 0, 0, (), map_covariance=covariance)
+
+
+def innovations(off: dict[float, str], seed: int = 1) -> EstimatedPath:
+    """Six beacons twice a second, of which those of some times are off: one name is one letter."""
+    rng = np.random.default_rng(seed)
+    times_s = np.arange(0.0, 120.0, 0.5)
+    found = [
+        ReadingInnovation(t, name, 60.0 if name in off.get(t, "") else float(rng.exponential(1.0)), 1, True)
+        for t in times_s.tolist()
+        for name in "abcdef"
+        if rng.random() < 0.2 or name in off.get(t, "")
+    ]
+    return track_of({}, np.zeros((0, 0)))._replace(innovations=tuple(found))
+
+
+def test_two_of_several_beacons_that_are_off_at_once_are_no_outliers() -> None:
+    at_once = {60.0 + 0.5 * k: "ab" for k in range(8)}
+    (line,) = sudden_disagreement(innovations(at_once))
+    assert "readings of 2 of " in line
+    assert "beacons are off at once, at 60 s" in line
+    alone = dict.fromkeys(at_once, "a")
+    assert sudden_disagreement(innovations(alone)) == []
+
+
+def test_beacons_that_are_often_off_are_not_moved_with_the_vehicle() -> None:
+    often = {float(t): "abcdef"[k % 6] + "abcdef"[(k + 2) % 6] for k, t in enumerate(range(0, 120, 6))}
+    assert sudden_disagreement(innovations(often)) == []
+    assert sudden_disagreement(innovations({})) == []
