@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from ccatp.beacons.datasets.consistency import inconsistencies
 from ccatp.beacons.datasets.tables import GAP_S, instant, long_pauses, plural
-from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor
+from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor, way_at
 from ccatp.beacons.estimation.recording import Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray
 
@@ -260,7 +260,8 @@ def _odometry_against(truth: ReferencePath, steps: Steps) -> Iterator[str]:
         return
     yield from _copied_odometry(truth, steps)
     t = truth.times_s[rows]
-    way = np.diff(amount_at(steps, steps.distance_m, t))
+    # Forward and backward cancel where the vehicle has no motion sideways, as in the noise of one that stands.
+    way = np.diff(way_at(steps, t) if steps.lateral_m.any() else amount_at(steps, steps.distance_m, t))
     true_way = np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows]))
     half_turn = np.minimum(0.5 * np.abs(np.diff(amount_at(steps, steps.turn_rad, t))), 1.0)
     chord = np.abs(way) * np.sinc(half_turn / np.pi)  # of the arc

@@ -136,17 +136,18 @@ def read_columns(path: Path, tag: str = "") -> Recording:
     warnings: list[str] = []
     numbers: dict[str, float] = {}
     table, tag = _of_one_tag(_read(file, text), tag, warnings)
+    has_tags = bool(warnings)
     events = tables_of(file, _readings(table, numbers))
     events |= dict([_motion(odometry[0])])
     if truths:
         events["truth"] = truths[0].poses()
-    if (beside := _places_beside(table, numbers)) is not None:
+    if (beside := _places_beside(table, numbers, warnings)) is not None:
         events["beacon"] = beside
     for survey in surveys.values():
         events["beacon"] = _survey(survey, numbers)
     for mount in mounts.values():
         events |= _antenna(mount, tag)
-    if warnings and "antenna" not in events:  # there are several tags, so not all are in the middle
+    if has_tags and "antenna" not in events:  # there are several tags, so not all are in the middle
         warnings.append(f"the place of tag {tag} is not known (no table of tag, forward, left): it is taken as zero")
     return Recording(file, name_of(file), "csv", events, tuple(numbers), tuple(warnings))
 
@@ -279,7 +280,7 @@ def _readings(table: ColumnFile, numbers: dict[str, float]) -> Iterator[tuple[st
             yield column.quantity, line, [time_s, beacon, table.value(line, cells, k)]
 
 
-def _places_beside(table: ColumnFile, numbers: dict[str, float]) -> Table | None:
+def _places_beside(table: ColumnFile, numbers: dict[str, float], warnings: list[str]) -> Table | None:
     """Places of the beacons beside their readings; those of a beacon that has several are not taken."""
     named = table.places.get("beacon")
     if named is None or not {"beacon_x", "beacon_y"} <= table.quantities:
@@ -291,6 +292,11 @@ def _places_beside(table: ColumnFile, numbers: dict[str, float]) -> Table | None
     first = np.unique(found[:, :3], axis=0, return_index=True)[1]
     found, lines = found[first], places.lines[rows[first]]
     alone = np.isin(found[:, 0], [beacon for beacon, count in Counter(found[:, 0].tolist()).items() if count == 1])
+    if not alone.all():
+        names = listed([name for name, number in numbers.items() if number in found[~alone, 0]])
+        warnings.append(
+            f"beacons with several places beside their readings: {names}; do they move? Each is taken to stand"
+        )
     return Table(table.file, found[alone], lines[alone]) if alone.any() else None
 
 

@@ -1,10 +1,11 @@
 """Units and clocks from the run itself: readings against the shape of the odometry, and the truth against it."""
 
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
+from scipy.optimize import fmin
 
 from ccatp.beacons.datasets.tables import instant
 from ccatp.beacons.datasets.trajectory import CONSTANT_RAD, STRAIGHT
@@ -40,6 +41,7 @@ FINE_S = np.arange(-0.5, 0.501, 0.05)
 LEAST_LAG_S = 0.6  # smaller ones are the delay that the estimators calibrate: two sigmas of its widest prior
 BETTER = 0.6  # of the misfit that remains with a lag, or in another unit
 MAJORITY = 0.65  # of the windows fit better
+LEAST_HEIGHT_M = 1.0
 FIRST_ARM_M, FINE_ARM_M, MOST_TRIES = 0.3, 0.01, 80  # of the search for the place of a radio on the vehicle
 LEAST_ARM_M, MOST_ARM_M = 0.15, 10.0  # above the error of the ranges, and as long as vehicles are
 CLEARLY = 0.9  # of the misfit that remains with another clock
@@ -54,6 +56,9 @@ LEAST_SHAPE_M = 0.3  # extent of a piece of the path
 
 def inconsistencies(run: RecordedRun) -> Iterator[str]:
     """Warnings about units and clocks that need no truth, and of a truth with another clock than the odometry."""
+    if not np.hypot(run.steps.distance_m, run.steps.lateral_m).any():
+        yield "the odometry never moves: is it of this run, and are its columns those of distances or places?"
+        return
     rare = list(_rare(run.steps))
     yield from rare
     yield from _heading_against_course(run.steps)
@@ -177,8 +182,8 @@ class _Windows:
     def __init__(self, run: RecordedRun) -> None:
         seen = run.readings.where(np.isfinite(run.readings.range_m) & (run.readings.range_m > 0.0))
         pointed = np.isfinite(seen.bearing_rad)
-        self._is_pointed = bool(pointed.sum() > 0.5 * pointed.size)
-        if self._is_pointed:
+        self.is_pointed = bool(pointed.sum() > 0.5 * pointed.size)
+        if self.is_pointed:
             seen = seen.where(pointed)
         self.times_s, self.range_m, self.bearing_rad = seen.times_s, seen.range_m, seen.bearing_rad
         self.group: IntArray = np.full(len(seen.times_s), -1, dtype=np.int64)
@@ -205,13 +210,33 @@ class _Windows:
         """Root mean square of the misfit of each window, m, if the path is taken ``lag_s`` later; shape (count,)."""
         at = _places(times_s, path, self.times_s + lag_s)
         counts = np.bincount(self.group, minlength=self.count)
-        if self._is_pointed:
+        if self.is_pointed:
             way = np.interp(self.times_s + lag_s, times_s, path[:, 2]) + self.bearing_rad
             at = at + self.range_m[:, None] * np.column_stack([np.cos(way), np.sin(way)])
-        middle = np.column_stack([np.bincount(self.group, column, self.count) / counts for column in at.T])
-        at = at - middle[self.group]
-        if self._is_pointed:
+        at = self._centred(at)
+        if self.is_pointed:
             return np.asarray(np.sqrt(np.bincount(self.group, (at**2).sum(axis=1), self.count) / (2 * counts - 2)))
+        fitted = self._fitted(at)
+        return np.asarray(np.sqrt(fitted.squares / np.maximum(counts - 3, 1)))
+
+    def heights_m2(self, times_s: FloatArray, path: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Square of the height of the beacon over the path that each window fits, and its sigma, m^2, shape (count,).
+
+        With a height h the free term is |b|^2 + h^2.
+        """
+        fitted = self._fitted(self._centred(_places(times_s, path, self.times_s)))
+        counts = np.bincount(self.group, minlength=self.count)
+        slope = np.column_stack([-0.5 * fitted.terms[:, :2], np.ones(self.count)])
+        spread = np.linalg.solve(fitted.normal, slope[:, :, None])[:, :, 0]
+        variance = (slope * spread).sum(axis=1) * fitted.squares / np.maximum(counts - 3, 1)
+        return fitted.terms[:, 2] - 0.25 * (fitted.terms[:, :2] ** 2).sum(axis=1), np.sqrt(np.maximum(variance, 0.0))
+
+    def _centred(self, at: FloatArray) -> FloatArray:
+        counts = np.bincount(self.group, minlength=self.count)
+        middle = np.column_stack([np.bincount(self.group, column, self.count) / counts for column in at.T])
+        return np.asarray(at - middle[self.group])
+
+    def _fitted(self, at: FloatArray) -> "_Fitted":
         weight = 0.5 / self.range_m  # an error of r^2 over 2 r is one of r
         rows = np.column_stack([at, np.ones(len(at))]) * weight[:, None]
         wanted = (self.range_m**2 - (at**2).sum(axis=1)) * weight
@@ -220,9 +245,19 @@ class _Windows:
         np.add.at(normal, self.group, rows[:, :, None] * rows[:, None, :])
         np.add.at(right, self.group, rows * wanted[:, None])
         ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        found = np.linalg.solve(normal + ridge + 1e-300 * np.eye(3), right[:, :, None])[:, :, 0]
-        errors = wanted - (rows * found[self.group]).sum(axis=1)
-        return np.asarray(np.sqrt(np.bincount(self.group, errors**2, self.count) / np.maximum(counts - 3, 1)))
+        normal = normal + ridge + 1e-300 * np.eye(3)
+        terms = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+        errors = wanted - (rows * terms[self.group]).sum(axis=1)
+        squares = np.bincount(self.group, errors**2, self.count).astype(np.float64)
+        return _Fitted(terms, normal, squares)
+
+
+class _Fitted(NamedTuple):
+    """Linear fits of -2 p b + |b|^2, one a window: its terms (n, 3), normal matrices, sums of squares, m^2."""
+
+    terms: FloatArray
+    normal: FloatArray
+    squares: FloatArray
 
 
 def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
@@ -233,6 +268,8 @@ def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
     if off := _radio_off_the_origin(windows, times_s, path):
         yield off
         return
+    if not windows.is_pointed:
+        yield from _above(*windows.heights_m2(times_s, path))
     middle_s = float(np.median(windows.begin_s))
     parts = [np.ones(windows.count, dtype=bool), windows.begin_s < middle_s, windows.begin_s >= middle_s]
     lags = _lags(lambda lag_s: windows.misfits(times_s, path, lag_s), parts)
@@ -254,6 +291,17 @@ def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
                 yield f"ranges fit an odometry that turns {factor:.3g} times as much: are its turns in {what}?"
 
 
+def _above(squares_m2: FloatArray, sigmas_m2: FloatArray) -> Iterator[str]:
+    if (
+        np.mean(squares_m2 > 2.0 * sigmas_m2) > MAJORITY
+        and (usual_m2 := float(np.median(squares_m2))) > LEAST_HEIGHT_M**2
+    ):
+        yield (
+            f"ranges are as those of beacons about {np.sqrt(usual_m2):.1g} m above or below the radio, or too long: "
+            "give the heights of the beacons (z) and of the antenna, or a prior of the offset"
+        )
+
+
 def _radio_off_the_origin(windows: _Windows, times_s: FloatArray, path: FloatArray) -> str:
     """A warning if ranges fit far better to a radio ahead or beside of where it should be, and better than with a lag.
 
@@ -265,9 +313,12 @@ def _radio_off_the_origin(windows: _Windows, times_s: FloatArray, path: FloatArr
         return windows.misfits(times_s, np.column_stack([antenna_path(path, (ahead_m, left_m)), path[:, 2]]))
 
     now = windows.misfits(times_s, path)
+
+    def typical(arm_m: FloatArray) -> float:
+        return _typical(misfits(arm_m), now)
+
     start = np.array([[0.0, 0.0], [FIRST_ARM_M, 0.0], [0.0, FIRST_ARM_M]])
-    options = {"initial_simplex": start, "xatol": FINE_ARM_M, "fatol": 1e-6, "maxfev": MOST_TRIES}
-    arm_m = minimize(lambda at: _typical(misfits(at), now), start[0], method="Nelder-Mead", options=options).x
+    arm_m = fmin(typical, start[0], xtol=FINE_ARM_M, ftol=1e-6, maxfun=MOST_TRIES, disp=False, initial_simplex=start)
     best, far_m = misfits(arm_m), float(np.hypot(*arm_m))
     if not LEAST_ARM_M <= far_m <= MOST_ARM_M or not _is_better(now, best):
         return ""

@@ -10,9 +10,10 @@ from scipy.stats import binom, chi2
 from ccatp.beacons.cricket.map_fit import map_rms_m
 from ccatp.beacons.datasets.checks import STRANGER_M
 from ccatp.beacons.datasets.tables import instant
-from ccatp.beacons.estimation.recording import EstimatedPath, KnownMap
+from ccatp.beacons.estimation.recording import EstimatedPath, KnownMap, RecordedRun
 from ccatp.beacons.rigid_motion import aligned_rms_m
 
+LEAST_BEACONS = 3  # of which most are as they should be
 MISSED = 5.0  # times the expected difference of map and survey, above which one of them is wrong
 MENDED = 0.3  # a changed position explains the difference if at most this share of it remains
 
@@ -84,6 +85,30 @@ def map_doubts(track: EstimatedPath, known_map: KnownMap) -> list[str]:
     return [
         f"the readings move the known places {ratio:.2g} times as far as their standard deviations of {usual_m:.2g} m "
         f"allow, so those of the path are too small as well: about {ratio * usual_m:.2g} m would fit"
+    ]
+
+
+FEWEST = 20  # readings of a beacon
+STRAY = 5.0  # times the usual miss of the beacons
+
+
+def stray_beacons(run: RecordedRun, track: EstimatedPath) -> list[str]:
+    """A warning for each beacon of which the ranges miss its place on the map far more than those of the others."""
+    misses_m = {}
+    for k, name in enumerate(run.beacon_ids):
+        seen = run.readings.where((run.readings.beacon == k) & np.isfinite(run.readings.range_m))
+        if name in track.beacons and len(seen.times_s) >= FEWEST:
+            x, y = (np.interp(seen.times_s, track.times_s, track.poses[:, axis]) for axis in (0, 1))
+            off_m = seen.range_m - np.hypot(track.beacons[name].x_m - x, track.beacons[name].y_m - y)
+            misses_m[name] = float(np.median(np.abs(off_m - np.median(off_m))))
+    if len(misses_m) < LEAST_BEACONS:
+        return []
+    usual_m = float(np.median(list(misses_m.values())))
+    return [
+        f"ranges of beacon {name} miss its place by {miss_m:.2g} m (half of them), those of the others by "
+        f"{usual_m:.2g} m: does it move?"
+        for name, miss_m in misses_m.items()
+        if miss_m > max(STRANGER_M, STRAY * usual_m)
     ]
 
 

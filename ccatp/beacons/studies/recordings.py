@@ -15,7 +15,7 @@ import numpy as np
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.cricket.measured_map import map_measured
-from ccatp.beacons.datasets.doubts import map_doubts, sudden_disagreement, survey_doubts
+from ccatp.beacons.datasets.doubts import map_doubts, stray_beacons, sudden_disagreement, survey_doubts
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
 from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
 from ccatp.beacons.estimation.causal import filter_run
@@ -63,7 +63,9 @@ def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> E
     if run.known_map is not None:
         surveyed += map_doubts(track, run.known_map)
     doubts = prediction_doubts(predicted(run, track, cfg.radio.camera_field_rad))
-    return track._replace(warnings=(*track.warnings, *sudden_disagreement(track), *surveyed, *doubts))
+    return track._replace(
+        warnings=(*track.warnings, *stray_beacons(run, track), *sudden_disagreement(track), *surveyed, *doubts)
+    )
 
 
 COMPARED = (

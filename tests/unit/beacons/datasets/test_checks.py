@@ -187,3 +187,16 @@ def test_a_radio_off_the_origin_is_no_other_clock(arm_m: tuple[float, float], wh
         assert all(word in line for word in what)
         sizes_m = [float(size) for size in re.findall(r"[\d.]+(?= m )", line)]
         assert sizes_m == pytest.approx(np.abs(arm_m), abs=0.05)  # sigma of a range
+
+
+def test_beacons_above_the_radio_are_told_from_those_in_its_plane() -> None:
+    nothing = np.full(READ.range_m.size, np.nan)
+    run = with_readings(range_m=np.hypot(READ.range_m, 2.5), bearing_rad=nothing)
+    (line,) = [line for line in suspicions(run) if "above or below" in line]
+    assert "about 2 m" in line or "about 3 m" in line
+    assert not any("above or below" in line for line in suspicions(with_readings(bearing_rad=nothing)))
+
+
+def test_an_odometry_that_never_moves_is_named() -> None:
+    said = suspicions(replace(with_steps(distance_m=ZEROS, turn_rad=ZEROS), truth=None))
+    assert any("the odometry never moves" in line for line in said)

@@ -297,3 +297,15 @@ def test_a_heading_that_turns_against_the_course_is_named(tmp_path: Path) -> Non
     run = read_run(tmp_path, None, None)
     assert any("turns against the course of its positions: is it clockwise" in line for line in run.warnings)
     assert not any("clockwise" in line for line in read_run(long_form(tmp_path), None, None).warnings)
+
+
+def test_a_beacon_with_several_places_beside_its_ranges_is_named(tmp_path: Path) -> None:
+    long_form(tmp_path)
+    (tmp_path / "anchors.csv").unlink()
+    rows: list[tuple[object, ...]] = [
+        (t, n, r, BEACONS[n][0] + (t if n == "7" else 0), BEACONS[n][1]) for t, n, r in RANGES
+    ]
+    file = write_lines(tmp_path / "uwb.csv", lines_of("time,anchor,range,anchor_x,anchor_y", rows))
+    run = read_run(file, None, None)
+    assert "beacons with several places beside their readings: 7; do they move?" in " | ".join(run.warnings)
+    assert run.beacon_truth_m == {name: at for name, at in BEACONS.items() if name != "7"}

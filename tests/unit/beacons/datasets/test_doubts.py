@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
-from ccatp.beacons.datasets.doubts import map_doubts, sudden_disagreement, survey_doubts
+from ccatp.beacons.datasets.doubts import map_doubts, stray_beacons, sudden_disagreement, survey_doubts
 from ccatp.beacons.estimation.causal import filter_run
 from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, KnownMap, ReadingInnovation, RecordedRun
 from tests.unit.beacons.datasets.sets import BEACONS, recorded, world
@@ -119,3 +119,17 @@ def test_beacons_that_are_often_off_are_not_moved_with_the_vehicle() -> None:
     often = {float(t): "abcdef"[k % 6] + "abcdef"[(k + 2) % 6] for k, t in enumerate(range(0, 120, 6))}
     assert sudden_disagreement(innovations(often)) == []
     assert sudden_disagreement(innovations({})) == []
+
+
+def test_a_beacon_that_moves_is_named() -> None:
+    cfg = load_recordings_config()
+    at = np.array([np.interp(READ.times_s, W.times_s, column) for column in W.poses[:, :2].T])
+    angle = 0.02 * READ.times_s
+    there = np.array([3.0 + 4.0 * np.cos(angle), 2.0 + 4.0 * np.sin(angle)])
+    moving = np.where(READ.beacon == 1, np.hypot(*(there - at)), READ.range_m)
+    run = replace(SOUND, readings=READ._replace(range_m=moving, bearing_rad=np.full(moving.size, np.nan)))
+    track = filter_run(run, cfg.csv, cfg.filter, lambda: 0.0)
+    (line,) = stray_beacons(run, track)
+    assert line.startswith("ranges of beacon 7 miss its place by ")
+    assert line.endswith("does it move?")
+    assert stray_beacons(SOUND, filter_run(SOUND, cfg.csv, cfg.filter, lambda: 0.0)) == []
