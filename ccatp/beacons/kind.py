@@ -11,6 +11,7 @@ BEACONS = MissionKind(
     no_faults="plans are for surveys; sim.incidents of the configuration holds those of beacons",
     load=Part("ccatp.beacons.config.load:load_beacon_mission"),
     text=Part("ccatp.beacons.daemon.beacon_run:beacon_text"),
+    check=Part("ccatp.beacons.daemon.beacon_run:check_beacons"),
     without_effect=Part("ccatp.beacons.config.effects:keys_without_effect"),
     processes=Part("ccatp.beacons.daemon.beacon_run:PROCESSES"),
     record=Part("ccatp.beacons.records.summary:beacon_record"),

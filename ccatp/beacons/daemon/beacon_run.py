@@ -3,12 +3,23 @@
 from dataclasses import replace
 
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.daemon.supervision.run_dir import RunOptions
 from ccatp.daemon.supervision.run_text import RunText, progress_text
 from ccatp.daemon.supervision.supervisor import WITHOUT_LASER
+from ccatp.errors import ConfigError
 from ccatp.links.topics import MissionStatus
 
 # Positions come from radio. When main dies, its map is lost, and the run ends, held.
 PROCESSES = tuple(replace(spec, is_replaceable=spec.is_replaceable and spec.name != "main") for spec in WITHOUT_LASER)
+
+
+def check_beacons(options: RunOptions, cfg: RadioConfig) -> None:
+    """Raises ``ConfigError`` if the simulated robot has no radio to follow: it would stand until the mission ends."""
+    if options.sim and cfg.follow.is_active and cfg.sim.target.motion == "none":
+        raise ConfigError(
+            'sim.target.motion = "none": there is no radio that the simulated robot could follow; give "random" or '
+            '"waypoints"'
+        )
 
 
 def beacon_text(cfg: RadioConfig) -> RunText:

@@ -117,6 +117,10 @@ REFUSED = [
     ("calibrate --from beacons", f"beacons/config.toml: {OF_BEACONS} report beacons\n"),
     ("plot beacons", "beacons: a mission among beacons; this is for surveys, ccatp report takes both"),
     ("check --sim --config zigbee", f"zigbee.toml: {OF_BEACONS} run or ccatp study with it\n"),
+    (
+        "run --sim --config zigbee --set follow.is_active=true",
+        'sim.target.motion = "none": there is no radio that the simulated robot could follow; give "random"',
+    ),
     ("radio calibrate nowhere.csv", "no such file"),
     ("radio calibrate sheets/rnd.csv", "is not text; give a CSV file or an .xlsx workbook with columns of levels"),
     ("radio calibrate sheets/flat.csv", "flat.csv: levels do not fall with distance"),
