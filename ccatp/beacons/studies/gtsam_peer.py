@@ -53,7 +53,7 @@ Progress = Callable[[int], Callable[[int], None]]  # from the number of instants
 
 
 def run_gtsam(
-    run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float], limit_s: float = np.inf,
+    run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float], limit_s: float,
     progress: Progress = lambda _: lambda _: None,
 ) -> Peers:  # fmt: skip
     """Both estimates of a run. ``limit_s``: longest time of iSAM2, s.

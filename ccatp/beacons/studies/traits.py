@@ -31,18 +31,22 @@ _COMPARED = ("path_m", "unaligned_m", "beacons_m")
 def run_trait(job: Job) -> JobOutcome:
     """One estimator on one simulated run: errors, NEES, and the share of positions inside their 95 % ellipse.
 
-    With a peer among the factors also the errors of that on the same run.
+    With a peer among the factors also the errors of that on the same run, unless it gave up or took too long.
     """
     traits, estimator = str(job.factors["traits"]), str(job.factors["estimator"])
     run = trait_run([] if traits == PLAIN else traits.split("+"), job.seed)
     begin_s = perf_counter()
     try:
         track = _track(run, job.cfg, estimator)
-        values: dict[str, Any] = {"run_s": perf_counter() - begin_s, **_errors(track, run)}
-        if (peer := job.factors.get("peer")) is not None:
-            values["peer"] = _errors(run_gtsam(run, job.cfg.csv, perf_counter)[PEERS.index(str(peer))], run)
-    except (PeerGaveUp, EstimateError):
+    except EstimateError:
         return JobOutcome({"gave_up": True})
+    values: dict[str, Any] = {"run_s": perf_counter() - begin_s, **_errors(track, run)}
+    if (peer := job.factors.get("peer")) is not None:
+        try:
+            peers = run_gtsam(run, job.cfg.csv, perf_counter, job.cfg.run.peer_limit_s)
+            values["peer"] = _errors(peers[PEERS.index(str(peer))], run)
+        except PeerGaveUp:
+            values["peer_gave_up"] = True
     if estimator in FILTERS:
         found = judge(track, run).nees
         values["nees"] = None if found is None else found.mean
@@ -75,9 +79,9 @@ def _covered(track: EstimatedPath, run: RecordedRun) -> float:
 
 
 def combine_traits(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """Medians of the errors, means of NEES and coverage, ratios to the peer, and how many estimators gave up."""
+    """Medians of the errors, means of NEES and coverage, ratios to the peer, and how often either gave up."""
     rows = [outcome.values for outcome in outcomes]
-    values: dict[str, Any] = {"gave_up": sum("gave_up" in row for row in rows)}
+    values: dict[str, Any] = {key: sum(key in row for row in rows) for key in ("gave_up", "peer_gave_up")}
     for key in (*_COMPARED, "nees", "covered", "run_s"):
         known = [row[key] for row in rows if row.get(key) is not None]
         values[key] = float(np.median(known) if key in _COMPARED else np.mean(known)) if known else None
@@ -116,7 +120,7 @@ STUDY = Study(
     run_job=run_trait,
     combine=combine_traits,
     columns="""
-        path_m unaligned_m beacons_m nees nees_most covered gave_up run_s
+        path_m unaligned_m beacons_m nees nees_most covered gave_up peer_gave_up run_s
         ratio.path_m: mean band
         ratio.unaligned_m: mean band
         ratio.beacons_m: mean band

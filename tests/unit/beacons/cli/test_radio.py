@@ -249,7 +249,7 @@ def no_clock() -> float:
 def test_both_solve_a_run_without_calibration_errors(bearings: bool) -> None:
     pytest.importorskip("gtsam", reason="the extra peers is not installed")
     run = recorded(world(seconds=60.0), bearings=bearings)
-    peers = run_gtsam(run, SETTINGS, no_clock)
+    peers = run_gtsam(run, SETTINGS, no_clock, np.inf)
     for track in peers:
         found = judge(track, run)
         assert found.trajectory_rmse_m == pytest.approx(0.0, abs=0.1)
@@ -264,12 +264,12 @@ def test_what_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
     nothing = np.full(len(run.readings.times_s), np.nan)
     received = replace(run, readings=run.readings._replace(range_m=nothing, rssi_dbm=nothing - 50.0))
     with pytest.raises(PeerGaveUp, match="no factor of signal strengths"):
-        run_gtsam(received, SETTINGS, no_clock)
+        run_gtsam(received, SETTINGS, no_clock, np.inf)
     with pytest.raises(PeerGaveUp, match=r"^simulated: GTSAM gave up: .*$"):
-        run_gtsam(replace(run, first_pose=(np.nan, 0.0, 0.0)), SETTINGS, no_clock)
+        run_gtsam(replace(run, first_pose=(np.nan, 0.0, 0.0)), SETTINGS, no_clock, np.inf)
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(PeerError, match=r"ccatp\[peers\]"):
-        run_gtsam(run, SETTINGS, no_clock)
+        run_gtsam(run, SETTINGS, no_clock, np.inf)
 
 
 def test_a_slow_peer_tells_how_far_it_is_and_stops_at_the_limit() -> None:
@@ -292,7 +292,7 @@ def test_a_peer_takes_a_known_map() -> None:
     pytest.importorskip("gtsam", reason="the extra peers is not installed")
     run, places_m = recorded(world(seconds=20.0), bearings=False), np.array([*BEACONS.values()])
     run = replace(run, known_map=KnownMap(tuple(BEACONS), places_m, 1e-6 * np.eye(8), np.full(4, np.nan)))
-    for track in run_gtsam(run, SETTINGS, no_clock):
+    for track in run_gtsam(run, SETTINGS, no_clock, np.inf):
         found = judge(track, run)
         assert found.beacon_rmse_m == pytest.approx(0.0, abs=0.01)
         assert found.trajectory_rmse_m == pytest.approx(0.0, abs=0.1)

@@ -57,3 +57,14 @@ def test_each_trait_and_each_pair_is_a_cell() -> None:
 def test_an_unknown_trait_is_refused() -> None:
     with pytest.raises(ValueError, match="no trait 'slow'"):
         run_trait(Job("traits", {"traits": "slow", "estimator": RECKONING}, 0, CFG))
+
+
+def test_a_peer_that_is_stopped_leaves_the_estimator_its_result() -> None:
+    pytest.importorskip("gtsam", reason="the extra peers is not installed")
+    short = load_recordings_config(None, {"run.peer_limit_s": 1e-6})
+    job = Job("traits", {"traits": PLAIN, "estimator": RECKONING, "peer": "GTSAM iSAM2"}, 1, short)
+    outcome = run_trait(job)
+    assert outcome.values["path_m"] > 0.0
+    assert "peer" not in outcome.values
+    found = combine_traits({}, [outcome]).values
+    assert (found["gave_up"], found["peer_gave_up"]) == (0, 1)
