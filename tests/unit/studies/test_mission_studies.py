@@ -278,7 +278,7 @@ def test_a_cell_names_the_missions_that_are_not_complete() -> None:
     ended: Any = {"is_recoverable": False, "weak_frames": 4, "outcome": "faulted", "cause": "held"}
     whole = mission([0.001], seed=1, is_recoverable=True, weak_frames=0, **injected)
     values, _ = faults_study.STUDY.combine({}, [whole, mission([0.001], seed=2, **ended, **injected)])
-    assert (values["complete"], values["ended"]) == (1, ["seed 2 stopped: held"])
+    assert (values["complete"], values["ended"]) == (1, ["seed 2 faulted: held"])
     assert values["recoverable"] == {"runs": 1, "complete": 1}
     assert (values["danger"]["false_edges"], values["weak_frames"]) == (2, 4)
     assert (values["injected"]["acted"], values["points"]["total"], values["time_ratio"]) == (22, 18, 1.1)
