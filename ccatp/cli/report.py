@@ -5,6 +5,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -148,11 +149,12 @@ def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: s
 @common.key_option("--mirror", "run.mirror", metavar="NAME", help="Of --points without a run directory.")
 @click.option(
     "--with",
-    "others",
+    "earlier",
     type=common.PATH,
     multiple=True,
     metavar="RUN_DIR",
-    help="Another survey of the same night: the laser network is adjusted to the lengths of all.",
+    help="An earlier survey of the same night, several in the order of measuring: the laser network is adjusted to the "
+    "lengths of all.",
 )
 @common.settings_option("A key of align or mirror, or robot.puck_height_m, as in align.point_floor_m=2e-6.")
 @click.option("--csv", "csv_file", type=common.OutputFile(), help="Write a line a panel (CSV).")
@@ -167,7 +169,7 @@ def align(
     unit: str | None,
     offset_mm: float,
     sigma_um: float | None,
-    others: tuple[Path, ...],
+    earlier: tuple[Path, ...],
     settings: Mapping[str, object],
     csv_file: Path | None,
     work_list: Path | None,
@@ -197,8 +199,9 @@ def align(
     cfg = survey.cfg
     mirror = build_mirror(cfg.mirror)
     planned = {point.panel for point in survey.planned}
-    with_others = [_measured_with(one, cfg, settings) for one in others]
-    result, network = align_survey(cfg, mirror, survey.measured, planned, with_others)
+    before = [_measured_with(one, cfg, settings) for one in earlier]
+    _check_order([*earlier, run_dir])
+    result, network = align_survey(cfg, mirror, survey.measured, planned, before)
     comparison = None if survey.injected is None else compare(result.panels, survey.injected)
     outliers = sum(len(panel.outliers) for panel in result.panels)
     facts = {
@@ -295,6 +298,18 @@ def _measured_with(run_dir: Path, cfg: "Config", settings: Mapping[str, object])
         if getattr(other.cfg.etalon, name) != getattr(cfg.etalon, name):
             raise UsageError(f"--with {run_dir}: its etalon.{name} is not that of the first run")
     return other.measured
+
+
+def _check_order(run_dirs: Sequence[Path]) -> None:
+    """Refuse surveys that were not measured in this order, as far as their recordings show it."""
+    from ccatp.records.run_reader import begun_utc_ns
+
+    begun = [(at_ns, run_dir) for run_dir in run_dirs if (at_ns := begun_utc_ns(run_dir)) is not None]
+    for (before_ns, before), (after_ns, after) in pairwise(begun):
+        if before_ns > after_ns:
+            raise UsageError(
+                f"--with: {before} was measured after {after}; name the latest survey first, before --with"
+            )
 
 
 @common.command(

@@ -66,13 +66,16 @@ def align_survey(
     mirror: Mirror,
     measured: Sequence[Measured],
     planned: Iterable[PanelId],
-    others: Sequence[Sequence[Measured]] = (),
+    earlier: Sequence[Sequence[Measured]] = (),
 ) -> AlignedSurvey:
-    """Adjust the laser network to all lengths, also to those of ``others`` (surveys of the same night); fit panels."""
-    network = calibrate_surveys(mirror, cfg.etalon, cfg.align, [measured, *others])
+    """Adjust the laser network to all lengths and fit the panels.
+
+    ``earlier``: surveys of the same night before this one, in the order of measuring.
+    """
+    network = calibrate_surveys(mirror, cfg.etalon, cfg.align, [*earlier, measured])
     common = None
     if network is not None:
-        own = network.surveys[0]
+        own = network.surveys[-1]
         measured, common = own.measured, own.common.of_point
     result = survey_result(mirror, cfg.align, cfg.robot.puck_height_m, measured, planned, common)
     return AlignedSurvey(result, network)

@@ -37,7 +37,7 @@ class RefinedSurvey(NamedTuple):
 
 
 class CalibratedSurveys(NamedTuple):
-    """The network of surveys, and their fixes by it. ``channels``: of the columns of the network."""
+    """The network of surveys in the order of measuring, and their fixes by it. ``channels``: of its columns."""
 
     network: NetworkResult
     channels: tuple[int, ...]

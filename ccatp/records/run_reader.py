@@ -22,7 +22,15 @@ from ccatp.links.bus_codec import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, deck_rows
-from ccatp.records.recorder import RECORD_FORMAT, TELEMETRY, decode_recorded, iter_messages, read_metadata, recordings
+from ccatp.records.recorder import (
+    RECORD_FORMAT,
+    TELEMETRY,
+    decode_recorded,
+    iter_logged,
+    iter_messages,
+    read_metadata,
+    recordings,
+)
 from ccatp.records.store import StoreError, read_survey
 from ccatp.records.timeline import Timeline, first_of_each, iter_places, read_timeline
 
@@ -405,6 +413,14 @@ def read_truth(run_dir: Path, warnings: list[str]) -> tuple[Injected | None, boo
         warnings.append("the sessions of this run simulated differently misaligned panels; the truth is not compared")
         return None, is_simulation
     return (found[0] if found else None), is_simulation
+
+
+def begun_utc_ns(run_dir: Path) -> int | None:
+    """When the recording of a run begins, ns since 1970; None where that is not known."""
+    for path in recordings(run_dir / TELEMETRY):
+        for utc_offset_ns, message in iter_logged(path):
+            return None if utc_offset_ns is None else utc_offset_ns + round(1e9 * message.t_s)
+    return None
 
 
 def _injected(path: Path) -> Injected | None:

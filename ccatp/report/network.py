@@ -36,8 +36,8 @@ def sentence(found: CalibratedSurveys | None) -> str:
 
 
 def _share_um(found: CalibratedSurveys) -> float:
-    """Standard deviation of a coordinate of a point by the network, rms over the points of the first survey, um."""
-    errors = np.array([*found.surveys[0].common.of_point.values()])
+    """Standard deviation of a coordinate of a point by the network, rms over the points of the last survey, um."""
+    errors = np.array([*found.surveys[-1].common.of_point.values()])
     return MICRO * float(np.sqrt(np.mean(np.sum(errors**2, axis=2)))) if len(errors) else 0.0
 
 

@@ -402,7 +402,7 @@ def test_a_survey_whose_lengths_contradict_each_other_at_a_point_does_not_use_it
 
 def test_a_slip_in_the_second_of_two_surveys_is_said_to_be_there() -> None:
     surveys = [survey(change, LIES) for change in (as_it_is, slipped)]
-    network = align_survey(CFG, M1, surveys[0], PANELS, surveys[1:]).network
+    network = align_survey(CFG, M1, surveys[1], PANELS, surveys[:1]).network
     text = sentence(network)
     assert text.startswith("The laser network has changed: channel 3 reads 3")
     assert " of survey 2 (" in text

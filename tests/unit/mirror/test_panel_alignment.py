@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from math import sqrt
 from pathlib import Path
@@ -37,6 +38,7 @@ from ccatp.mirror.panel_alignment import (
     quadratic,
     rigid,
 )
+from ccatp.records.recorder import TELEMETRY, Recorder, RobotClock
 from ccatp.sim.world import draw_misalignments
 from tests.support.command import answered, printed
 from tests.support.recorded import make_run, record
@@ -540,6 +542,15 @@ def test_two_surveys_of_a_night_are_adjusted_together(tmp_path: Path, capsys: py
     assert [(one["row"], one["col"]) for one in found["panels"]] == [ALIGNED]
     assert main(["align", str(tmp_path / "first"), "--with", str(tmp_path / "other")]) == 2
     assert "its etalon.offset_sigma_m is not that of the first run" in capsys.readouterr().err
+    # A change begins at a point and lasts, so the order of the surveys matters.
+    for name, begun_s in (("first", 9000.0), ("second", 5000.0)):
+        clock = RobotClock(is_simulation=True, now_ns=partial(round, 1e9 * begun_s))
+        recorder = Recorder(tmp_path / name / TELEMETRY, [("mission", {})], is_simulation=True, clock=clock)
+        recorder.write("mission", 1.0, b"{}")
+        recorder.close()
+    aligned(capsys, tmp_path / "first", "--with", str(tmp_path / "second"))
+    assert main(["align", str(tmp_path / "second"), "--with", str(tmp_path / "first")]) == 2
+    assert "name the latest survey first" in capsys.readouterr().err
 
 
 def test_a_survey_without_a_panel_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
