@@ -35,7 +35,7 @@ from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.escalation import SeverityEscalation, most_severe, with_findings
 from ccatp.safety.health_monitor import HealthMonitor
 from ccatp.safety.rules import SafetyRules
-from ccatp.sensing.sample_times import possible_samples
+from ccatp.sensing.sample_times import possible_gravity, possible_samples
 
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1
@@ -150,12 +150,12 @@ class DangerMonitor(SafetyRules):
     def _with_possible_times(self, frame: Sensors, t_s: float) -> Sensors:
         """The frame without samples of impossible times. What is left out is missing, and it is reported."""
         imu, enc = possible_samples(frame.t, frame.imu), possible_samples(frame.t, frame.enc)
-        edge = possible_samples(frame.t, frame.edge)
-        if imu is frame.imu and enc is frame.enc and edge is frame.edge:
+        edge, gravity = possible_samples(frame.t, frame.edge), possible_gravity(frame.t, frame.gravity)
+        if imu is frame.imu and enc is frame.enc and edge is frame.edge and gravity is frame.gravity:
             return frame
         if self._health is not None:
             self._health.misdated(t_s, frame)
-        return msgspec.structs.replace(frame, imu=imu, enc=enc, edge=edge)
+        return msgspec.structs.replace(frame, imu=imu, enc=enc, edge=edge, gravity=gravity)
 
     # -- monitors -------------------------------------------------------------------------------------------------
 

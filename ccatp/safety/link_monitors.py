@@ -8,14 +8,15 @@ from ccatp.conditions import MonitorFinding
 from ccatp.conditions import danger as conditions
 from ccatp.conditions.danger import SAMPLE_RATES
 from ccatp.config.models import HealthConfig
-from ccatp.core import EdgeSample, ImuSample, WheelSample
+from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.safety.monitor import Monitor
 from ccatp.sensing.sample_times import LATEST_S, OLDEST_S, worst_offset_s
 
 
-def _kinds(frame: Sensors) -> tuple[tuple[str, Sequence[ImuSample | WheelSample | EdgeSample]], ...]:
-    return ("imu", frame.imu), ("enc", frame.enc), ("edge", frame.edge)
+def _kinds(frame: Sensors) -> tuple[tuple[str, Sequence[ImuSample | WheelSample | EdgeSample | GravitySample]], ...]:
+    gravity = () if frame.gravity is None else (frame.gravity,)
+    return ("imu", frame.imu), ("enc", frame.enc), ("edge", frame.edge), ("gravity", gravity)
 
 
 class FrameMonitor(Monitor):

@@ -31,6 +31,6 @@ def possible_gravity(frame_s: float, sample: GravitySample | None) -> GravitySam
     return sample if sample is not None and -OLDEST_S <= sample[0] - frame_s <= LATEST_S else None
 
 
-def worst_offset_s(frame_s: float, samples: Sequence[ImuSample | WheelSample | EdgeSample]) -> float:
+def worst_offset_s(frame_s: float, samples: Sequence[ImuSample | WheelSample | EdgeSample | GravitySample]) -> float:
     """Offset to the frame, s, of the sample that is furthest from it; > 0: later. 0 without samples."""
     return max((sample[0] - frame_s for sample in samples), key=abs, default=0.0)

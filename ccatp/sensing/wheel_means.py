@@ -1,6 +1,7 @@
 """Mean wheel rates of a frame, from the encoder samples that are possible."""
 
 from collections.abc import Sequence
+from math import isfinite
 
 from ccatp.config.models import RobotConfig
 from ccatp.core import WheelSample
@@ -29,11 +30,12 @@ class WheelMeans:
         count = len(right)
         try:
             right_rad_s, left_rad_s = sum(right) / count, sum(left) / count
+            least, largest = min(*right, *left), max(*right, *left)
         except TypeError:  # a wheel gave no sample
             self._take_some(right, left)
             return
         limit = self._limit_rad_s
-        if not (-limit <= right_rad_s <= limit and -limit <= left_rad_s <= limit):
+        if not (-limit <= least <= largest <= limit and isfinite(right_rad_s + left_rad_s)):
             self._take_some(right, left)
             return
         self.right_rad_s = right_rad_s

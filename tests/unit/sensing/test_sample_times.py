@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from ccatp.conditions import Condition, text_of
 from ccatp.conditions.danger import EDGE_STALE, ENCODERS_STALE, SAMPLES_MISDATED
-from ccatp.core import EdgeSample, ImuSample, Severity, Verdict, WheelSample
+from ccatp.core import EdgeSample, GravitySample, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
@@ -43,11 +43,12 @@ def frames(wrong: str, offset_s: float | None, from_s: float = 1.0) -> Iterator[
         t = 0.01 * seq
         times = [t - 1e-3 * k for k in reversed(range(10))]
         late = times if t < from_s else [] if offset_s is None else [s + offset_s for s in times]
-        stamps = {kind: late if kind == wrong else times for kind in ("imu", "enc", "edge")}
+        stamps = {kind: late if kind == wrong else times for kind in ("imu", "enc", "edge", "gravity")}
         frame = Sensors(
             seq, t, [ImuSample(s, 1e-3 * (seq % 7), 1e-4 * (seq % 11)) for s in stamps["imu"][-1:]],
             [WheelSample(s, 0.0, 0.0) for s in stamps["enc"]], [EdgeSample(s, 1, 1, 1, 1) for s in stamps["edge"]],
-            None, (0.8, 0.8), 1.0, CommandEcho(seq, 0.0, 0.0, False), [],
+            GravitySample(stamps["gravity"][-1], 0.0, 0.0, -1.0), (0.8, 0.8), 1.0,
+            CommandEcho(seq, 0.0, 0.0, False), [],
         )  # fmt: skip
         estimate = EstimateMessage(
             seq=seq, t_s=t, x_m=panel.x_m, y_m=panel.y_m, heading_rad=0.0, sigma_m=1e-4, state="driving",
@@ -72,9 +73,10 @@ def test_a_sensor_whose_samples_have_impossible_times_is_silent(kind: str, row: 
 
 
 @pytest.mark.parametrize("offset_s", [-1.02, 0.4])
-def test_inertial_samples_of_impossible_times_are_reported_and_not_used(offset_s: float) -> None:
-    verdicts = list(frames("imu", offset_s))
+@pytest.mark.parametrize(("kind", "name"), [("imu", "accelerometer and gyroscope"), ("gravity", "gravity sensors")])
+def test_other_samples_of_impossible_times_are_reported_and_not_used(kind: str, name: str, offset_s: float) -> None:
+    verdicts = list(frames(kind, offset_s))
     assert all(verdict.raised for verdict in verdicts)
     way = "older than" if offset_s < 0.0 else "later than"
-    assert text_of(verdicts[0].cause) == f"samples of the accelerometer and gyroscope are {way} their frame: not used"
+    assert text_of(verdicts[0].cause) == f"samples of the {name} are {way} their frame: not used"
     assert verdicts[0].value == pytest.approx(abs(offset_s), abs=0.01)
