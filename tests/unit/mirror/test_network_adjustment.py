@@ -417,7 +417,7 @@ def test_a_slip_that_is_gone_in_the_second_of_two_surveys_is_one_change(
     change: Callable[[int, dict[int, float]], dict[int, float]], since: int
 ) -> None:
     surveys = [survey(one, LIES) for one in (change, as_it_is)]
-    network = align_survey(CFG, M1, surveys[0], PANELS, surveys[1:]).network
+    network = align_survey(CFG, M1, surveys[1], PANELS, surveys[:1]).network
     assert network is not None
     (finding,) = network.network.findings
     assert finding.effect == Effect(EffectKind.OFFSET, 2, since, until=len(surveys[0]))
