@@ -82,6 +82,7 @@ def study(
         load = found.loader.get()
         if found.of_config is not None:
             found = found.of_config(found, load(config_file, settings))
+        common.warn(found.notes)
         result = run_campaign(found, lambda keys: load(config_file, keys), options)
     else:
         idle = {"--cluster": cluster, "--shard": shard, "--from": others, "--only": only, "--mirror": mirrors}

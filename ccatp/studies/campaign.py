@@ -108,6 +108,7 @@ class Study:
     # Published values of a cell: ``printed`` in its result.
     published: Callable[[Factors], Mapping[str, Any]] | None = None
     of_config: Callable[["Study", Any], "Study"] | None = None  # the study with the cells that a configuration asks for
+    notes: Sequence[str] = ()  # warnings before it runs
     with_peers: Callable[[], Sequence[Cell]] | None = None  # its cells, with those of programs by other authors
     name: str = ""  # name and title are those of the table of studies, see ``find_study``
     title: str = ""

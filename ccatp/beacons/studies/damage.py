@@ -12,7 +12,7 @@ from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.datasets.tables import RadioDataError, Table
 from ccatp.beacons.estimation.evaluation import TrackEvaluation, judge, truth_at
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, ReferencePath
-from ccatp.beacons.studies.recorded_sets import events_of, read_again, recorded_run, recorded_window, sets_in
+from ccatp.beacons.studies.recorded_sets import events_of, found_in, read_again, recorded_run, recorded_window, sets_in
 from ccatp.beacons.studies.recordings import EstimateError, estimate
 from ccatp.core import FloatArray
 from ccatp.missions import Part
@@ -344,7 +344,9 @@ STUDY = Study(
     columns=f"{' '.join(OUTCOMES)} wrong_unsurveyed wrong_cases",
     draw=lambda _cells, _out: None,
     mirrors=(),
-    of_config=lambda study, cfg: replace(study, runs=len(cases_of(cfg.run.data))),
+    of_config=lambda study, cfg: replace(
+        study, runs=len(cases_of(cfg.run.data)), notes=found_in(cfg.run.data).left_out
+    ),
     runs=30,
     loader=Part("ccatp.beacons.config.load:load_recordings_config"),
 )

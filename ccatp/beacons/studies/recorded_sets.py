@@ -27,6 +27,7 @@ class RecordedSet(NamedTuple):
     topics: str = ""
 
 
+RECORDINGS = (".csv", ".txt", ".tsv", ".mat", ".pyfg", ".bag", ".db3", ".mcap")  # last parts of their names
 SHIPPED = {
     "Plaza2": RecordedSet("plaza/Plaza2_.mat"),
     "MRCLAM 7": RecordedSet("mrclam/set7", (1, 2, 3, 4, 5)),
@@ -36,9 +37,16 @@ SHIPPED = {
 }
 
 
+class Found(NamedTuple):
+    """Sets of a folder by name, and a line for each file or folder in it that looks like one and cannot be read."""
+
+    sets: Mapping[str, RecordedSet]
+    left_out: tuple[str, ...] = ()
+
+
 @cache
-def sets_in(folder: str) -> Mapping[str, RecordedSet]:
-    """Sets by name: those of ``SHIPPED`` that the folder holds, or else every recording in it that can be read.
+def found_in(folder: str) -> Found:
+    """The sets of ``SHIPPED`` that the folder holds, or else every recording in it that can be read.
 
     The folder may also be one set, or a file. A bag needs its topics in NAME.toml beside it. Raises CampaignError: no
     folder is given, or it holds no recording.
@@ -46,31 +54,52 @@ def sets_in(folder: str) -> Mapping[str, RecordedSet]:
     if not folder:
         raise CampaignError("where the recordings are is not known; give --data DIR")
     where = Path(folder)
-    if found := {name: one for name, one in SHIPPED.items() if (where / one.path).exists()}:
-        return found
-    reason = "no such file or folder"
-    for path in (where, *(sorted(where.iterdir()) if where.is_dir() else ())):
+    if shipped := {name: one for name, one in SHIPPED.items() if (where / one.path).exists()}:
+        return Found(shipped)
+    reason, left_out = "", list[str]()
+    try:
+        return Found({name_of(where.resolve()): _own_set(where, where)})
+    except (RadioDataError, OSError) as error:
+        reason = str(error)
+    found: dict[str, RecordedSet] = {}
+    for path in sorted(where.iterdir()) if where.is_dir() else ():
         try:
-            form = found_format(path)
+            one = _own_set(where, path)
         except (RadioDataError, OSError) as error:
-            reason = str(error) if path == where else reason
+            if path.is_dir() or {*RECORDINGS} & {*path.suffixes}:
+                left_out.append(str(error))
             continue
-        robots = tuple(robots_in(path if path.is_dir() else path.parent)) if form == "mrclam" else (None,)
-        topics = path.with_name(f"{name_of(path)}.toml") if form == "bag" else None
-        own = RecordedSet(str(path.relative_to(where)), robots, str(topics) if topics and topics.is_file() else "")
-        if path == where:
-            return {name_of(path.resolve()): own}
-        found[name_of(path)] = own
+        found[path.name if name_of(path) in found else name_of(path)] = one
     if not found:
-        raise CampaignError(f"--data {folder}: holds no recording ({reason})")
-    return found
+        raise CampaignError(f"--data {folder}: holds no recording ({'; '.join(left_out[:1]) or reason})")
+    return Found(found, tuple(f"not used: {line}" for line in left_out))
+
+
+def sets_in(folder: str) -> Mapping[str, RecordedSet]:
+    """Sets by name; see ``found_in``."""
+    return found_in(folder).sets
+
+
+def _own_set(where: Path, path: Path) -> RecordedSet:
+    """The set of a file or folder. Raises RadioDataError: it cannot be read."""
+    form = found_format(path)
+    robots = tuple(robots_in(path if path.is_dir() else path.parent)) if form == "mrclam" else (None,)
+    topics = path.with_name(f"{name_of(path)}.toml") if form == "bag" else None
+    one = RecordedSet(str(path.relative_to(where)), robots, str(topics) if topics and topics.is_file() else "")
+    for robot in robots:
+        _read(str(path), robot, one.topics)
+    return one
 
 
 @cache
+def _read(path: str, robot: int | None, topics: str) -> RecordedRun:
+    return read_run(Path(path), None, robot, Path(topics) if topics else None)
+
+
 def recorded_run(folder: str, name: str, robot: int | None) -> RecordedRun:
     """One run of a set. Raises CampaignError: no folder is given. Raises RadioDataError: the set does not exist."""
     one = sets_in(folder)[name]
-    return read_run(Path(folder) / one.path, None, robot, Path(one.topics) if one.topics else None)
+    return _read(str(Path(folder) / one.path), robot, one.topics)
 
 
 @cache

@@ -25,7 +25,7 @@ from ccatp.beacons.estimation.path_loss import fit_path_loss
 from ccatp.beacons.estimation.predictions import predicted, prediction_doubts
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, Progress, import_gtsam, run_gtsam
-from ccatp.beacons.studies.recorded_sets import SHIPPED, recorded_run, recorded_window, sets_in
+from ccatp.beacons.studies.recorded_sets import SHIPPED, found_in, recorded_run, recorded_window, sets_in
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.filters.base import FilterError
 from ccatp.missions import Part
@@ -223,7 +223,8 @@ def recordings_cells(estimators: Sequence[str] = FILTERS) -> list[Cell]:
 
 def of_folder(study: Study, cfg: RecordingsConfig) -> Study:
     """The study of the sets that the folder holds, with the estimators of the study."""
-    sets = sets_in(cfg.run.data)
+    sets, left_out = found_in(cfg.run.data)
+    study = replace(study, notes=left_out)
     shipped = [cell for cell in study.cells() if cell.factors["data"] in (*sets, ANCHORS, LEVELS)]
     if any(cell.factors["data"] in sets for cell in shipped):
         return replace(study, cells=lambda: shipped)

@@ -13,6 +13,7 @@ from ccatp.beacons.estimation.motion import Steering
 from ccatp.beacons.studies import cricket_study, mote_runs
 from ccatp.beacons.studies.cricket_study import combine, run_job
 from ccatp.beacons.studies.damage import DAMAGES, Damage, run_damage
+from ccatp.beacons.studies.damage import STUDY as DAMAGE
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp
 from ccatp.beacons.studies.mote_navigation import combine as mote_navigation_combine
 from ccatp.beacons.studies.mote_runs import run_batch, run_filter, simulate_field, sure_rms_m
@@ -250,8 +251,31 @@ def test_the_studies_take_the_recordings_of_ones_own_folder(tmp_path: Path) -> N
     assert found["path_m"] < 0.3
     damaged = run_damage(Job("damage", {"damage": "5 % ranges of 0 m", "estimator": "ekf-slam"}, 0, cfg)).values
     assert damaged["outcome"] == "recovered"
+    assert study.notes == ()
     with pytest.raises(CampaignError, match="holds no recording"):
         sets_in(str(tmp_path / "none"))
+
+
+def test_a_recording_of_the_folder_that_cannot_be_read_is_named_and_the_others_are_used(tmp_path: Path) -> None:
+    write_lines(tmp_path / "run.csv", csv_lines(world(seconds=60.0)))
+    (tmp_path / "run").mkdir()
+    write_mrclam(tmp_path / "run", world(seconds=60.0), robot=2)
+    write_lines(tmp_path / "ranges.csv", ["time,anchor,range", "1,A,2"])
+    (tmp_path / "strange").mkdir()
+    (tmp_path / "notes.md").write_text("nothing", encoding="utf-8")
+    cfg = load_recordings_config(None, {"run.data": str(tmp_path)})
+    for study in (RECORDINGS, DAMAGE):
+        assert study.of_config is not None
+        notes = study.of_config(study, cfg).notes
+        assert len(notes) == 2
+        assert all(note.startswith("not used: ") for note in notes)
+        assert "has 0 tables of odometry and 0 of truth beside ranges.csv" in notes[0]
+        assert f"{tmp_path / 'strange'}: none of the formats" in notes[1]
+    assert [*sets_in(str(tmp_path))] == ["run", "run.csv"]
+    (tmp_path / "alone").mkdir()
+    write_lines(tmp_path / "alone" / "uwb.csv", ["time,anchor,range", "1,A,2"])
+    with pytest.raises(CampaignError, match=r"holds no recording \(.*alone: has 0 tables of"):
+        sets_in(str(tmp_path / "alone"))
 
 
 def test_a_damage_that_needs_a_survey_is_impossible_without_one(tmp_path: Path) -> None:
