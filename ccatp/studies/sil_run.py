@@ -18,7 +18,18 @@ import numpy as np
 from ccatp.clocks import SteadyTime
 from ccatp.conditions import text_of
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EventCode, Fix, FloatArray, Measured, PanelPose, PointId, Verdict, unreliable_points
+from ccatp.core import (
+    Cause,
+    DeckPose,
+    EventCode,
+    Fix,
+    FloatArray,
+    Measured,
+    PanelPose,
+    PointId,
+    Verdict,
+    unreliable_points,
+)
 from ccatp.daemon.loops.mission_runner import STILL, DriveCommand, TimedFrame
 from ccatp.daemon.loops.survey_pipeline import SurveyPipeline
 from ccatp.danger import DangerMonitor
@@ -45,6 +56,7 @@ from ccatp.survey.events import DONE, Fault, FixFailed, FixStored, Mode, PointMi
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.fix_review import REPEATS, ReviewedFix
 from ccatp.survey.route_follower import StateEstimate
+from ccatp.survey.state import by_reason
 from ccatp.survey.statechart import Mission
 
 # A mission that takes this many times its bound hangs; the robot's own deadlines should have ended it long before.
@@ -378,7 +390,6 @@ class SilRun:
         if point is not None:
             row = laser.stop_row(frame.t, point, self.trace.truth_at(frame.seq), localizer)
         review.begin()
-        fix: Fix | None = None
         try:
             fix = self._fix(frame.t)
             found = self._fuse(fix)
@@ -386,15 +397,12 @@ class SilRun:
                 if found.doubt and not found.refusal:
                     fix = self._fix(frame.t)
                     found = self._fuse(fix)
-            doubt, refusal = found.doubt, found.refusal
         except MultilaterationError as error:
             expected_m = self.mirror.puck_world(localizer.deck_pose, self.cfg.robot.puck_height_m)
-            doubt, refusal = str(error), review.refusal_of(laser.lengths_m, expected_m)
-        if refusal:
-            mission.handle(Fault(refusal))
+            self._fail(point, str(error), review.refusal_of(laser.lengths_m, expected_m))
             return
-        if doubt or fix is None:
-            mission.handle(FixFailed(point, doubt, self.parts.heading_sigma_rad()))
+        if found.doubt:
+            self._fail(point, found.doubt, found.refusal)
             return
         localizer.notices.clear()
         if point is not None and row is not None:
@@ -403,6 +411,10 @@ class SilRun:
                 mission.handle(PointMissed())
                 return
         mission.handle(FixStored(point, self.parts.heading_sigma_rad()))
+
+    def _fail(self, point: PointId | None, why: str, refusal: Cause) -> None:
+        """There is no fix; with ``refusal`` the laser system must not be used any more."""
+        self.mission.handle(Fault(refusal) if refusal else FixFailed(point, why, self.parts.heading_sigma_rad()))
 
     def _fix(self, t_s: float) -> Fix:
         """Measure, with the retries of the client (raises MultilaterationError of the last one)."""
@@ -423,7 +435,8 @@ class SilRun:
         injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
         points, track, builder = state.points, self.trace.join(), self.trace.builder
         is_complete = state.outcome is SurveyOutcome.COMPLETE
-        builder.set_mission(len(points.done), len(points.skipped), mission_time_s, is_complete=is_complete)
+        left_out = by_reason(self.mission.survey.left_out(state))
+        builder.set_mission(len(points.done), len(points.skipped), mission_time_s, left_out, is_complete=is_complete)
         builder.add_grip(self.thrust.friction, self.thrust.margin)
         builder.set_panels(self.laser.panel_fits(), injected)
         builder.set_unreliable(self.laser.unreliable_points())

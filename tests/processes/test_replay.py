@@ -22,7 +22,8 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.mirror_alignment import compare, survey_result
 from ccatp.records.recorder import iter_messages
 from ccatp.records.run_reader import open_recordings, read_run
-from ccatp.studies.sil_run import rehearse
+from ccatp.sim.fault_plan import read_plan
+from ccatp.studies.sil_run import SilRun, rehearse
 from tests.faults.linking import Measured
 from tests.processes.conftest import Start
 from tests.support.runs import RecordedRun, Run, figures_of
@@ -235,6 +236,34 @@ def test_a_rehearsal_is_the_run_without_the_sockets(
 
     assert run.summary["ended"]["what"] == rehearsal.outcome == "complete"
     assert figures_of(run.summary) == figures_of(json.loads(json.dumps(rehearsal.summary)))
+
+
+@pytest.mark.parametrize(
+    "fault", ['type = "at_rest"', 'type = "noisy"\nfactor = 3e4', 'type = "offset"\nchannel = 2\noffset_m = 0.2']
+)
+def test_a_fault_of_the_laser_acts_alike_with_and_without_the_sockets(start: Start, tmp_path: Path, fault: str) -> None:
+    """Fixes are refused, repeated and given up in the same places, and the mission ends alike."""
+    plan = tmp_path / "plan.toml"
+    plan.write_text(f'[[fault]]\nsignal = "laser"\nat_s = 12.0\nfor_s = 25.0\n{fault}\n')
+    run = start("--panels", "1", "--mirror", "thesis-m1", "--seed", "3", "--faults", str(plan))
+    run.wait()
+    mission = SilRun(load_config(run.run_dir / "config.toml"), read_plan(plan, lockstep=True))
+    rehearsal = mission.run()
+    messages = iter_messages(run.run_dir / "telemetry.mcap")
+    batches = [json.loads(message.payload)["rows"] for message in messages if message.topic == "truth"]
+    driven = np.array([row[1:5] for rows in batches for row in rows])
+    rehearsed = rehearsal.track[:, :4]
+    assert len(rehearsed) > 2000
+    common = min(len(driven), len(rehearsed))
+    differs = np.flatnonzero((driven[:common] != rehearsed[:common]).any(axis=1))
+    assert differs.size == 0, f"first in frame {differs[0]}: {driven[differs[0]]} is not {rehearsed[differs[0]]}"
+    points, rehearsed_points = (dict(one["points"]) for one in (run.summary, rehearsal.summary))
+    left_out, rehearsed_left_out = (one.pop("left_out", {}) for one in (points, rehearsed_points))
+    assert points == rehearsed_points
+    # The daemon's client names the server beside the reason.
+    assert sorted(left_out.values()) == sorted(rehearsed_left_out.values())
+    assert run.summary["ended"]["what"] == rehearsal.outcome
+    assert run.summary["ended"]["condition"] == mission.mission.state.cause.condition
 
 
 # -- missions among beacons --------------------------------------------------------------------------------------------
