@@ -18,12 +18,15 @@ import numpy as np
 
 from ccatp.config.models import Config, PhysicsConfig
 from ccatp.core import GRAVITY_M_S2, DeckPose
-from ccatp.errors import ConfigError
+from ccatp.errors import CcatpError, ConfigError, one_line
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import Axes, tangent_axes
 from ccatp.sim.hardware import Motor, SimulatedHardware
 from ccatp.sim.plant import Plant
 from ccatp.sim.world import World
+
+# What MuJoCo says of a step. It would write it to a file of its own, put the body back to its start, and go on.
+_COMPLAINTS: list[str] = []
 
 _TYRE_PRIORITY = 2  # of contacts: the tyre's friction is used, not the mirror's
 
@@ -62,8 +65,18 @@ _FLAT = (
 )
 
 
+class UnstablePhysicsError(CcatpError):
+    """MuJoCo could not compute a step: the motion after it is not that of a body."""
+
+    def __init__(self, t_s: float, complaint: str) -> None:
+        super().__init__(
+            f"the physics of the simulated robot failed at {t_s:.3f} s ({one_line(complaint)}); look at"
+            " sim.physics.*: mass_kg, thrust_n, rotor_inertia_kg_m2, contact_s; or raise servo.loop_hz"
+        )
+
+
 class PhysicsPlant(Plant):
-    """The body; ``step`` takes motor voltages instead of set points.
+    """The body; ``step`` takes motor voltages instead of set points, and raises ``UnstablePhysicsError``.
 
     Attributes:
         thrust_n: of the fans, along the robot's normal, towards the surface.
@@ -85,6 +98,8 @@ class PhysicsPlant(Plant):
         self._mujoco: Any = mujoco
         self._motor, self._step_s = motor, step_s
         self._mirror, self._surface = mirror, mirror.surface
+        mujoco.set_mju_user_warning(_COMPLAINTS.append)
+        _COMPLAINTS.clear()
         self._model = self._build(cfg.sim.physics, robot.wheel_radius_m, robot.wheel_base_m)
         self._data = mujoco.MjData(self._model)
         body = self._model.body("robot").id
@@ -137,6 +152,8 @@ class PhysicsPlant(Plant):
         _, _, nx, _, _, ny, _, _, nz = self._rotation.tolist()
         self._force[:] = -self.thrust_n * nx, -self.thrust_n * ny, -self.thrust_n * nz
         self._mujoco.mj_step(self._model, data)
+        if _COMPLAINTS:
+            raise UnstablePhysicsError(t_s, _COMPLAINTS[0])
         self._read_state()
         dx, dy = self.x_m - x, self.y_m - y
         self.forward_m, self.left_m, self.turn_rad = (

@@ -1,7 +1,8 @@
 """The plant against integration of its equations of motion; the robot with real physics where grip is short."""
 
 import sys
-from math import atan2, exp, pi, radians, sqrt
+from math import atan2, exp, nan, pi, radians, sqrt
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from ccatp.core import DeckPose
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.hardware import DriveTrain
-from ccatp.sim.physics import PhysicsHardware
+from ccatp.sim.physics import PhysicsHardware, UnstablePhysicsError
 from ccatp.sim.plant import (
     BodyStep,
     Creep,
@@ -362,6 +363,19 @@ def test_the_same_commands_give_the_same_run() -> None:
         run(hardware, 0.5, 3.0, 1.0)
         ends.append((hardware.plant.x_m, hardware.plant.y_m, hardware.plant.heading_rad))
     assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize("voltage_v", [1e30, nan])
+def test_a_step_that_the_engine_cannot_compute_ends_the_simulation(
+    voltage_v: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    plant = robot().plant
+    plant.step(0.0, STEP_S, 1.0, 1.0)
+    with pytest.raises(UnstablePhysicsError, match=r"^the physics of the simulated robot failed at 0\.002 s .*simul"):
+        plant.step(STEP_S, STEP_S, voltage_v, 0.0)
+    assert not list(tmp_path.iterdir())
+    robot().plant.step(0.0, STEP_S, 1.0, 1.0)  # the next one starts anew
 
 
 def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
