@@ -21,6 +21,17 @@ class SampleKind(NamedTuple):
     texts: tuple[str, ...] = ()  # those of the values that are texts
 
 
+class SessionFrames(NamedTuple):
+    """The frames of one recording.
+
+    ``number``: of the recording, from 1. ``offset_s``: time of the run less that of the recording.
+    """
+
+    number: int
+    offset_s: float
+    frames: Iterable[RecordedFrame]
+
+
 def _gravity(frame: RecordedFrame) -> Iterator[Row]:
     if frame.sensors.gravity is not None:
         yield frame.sensors.gravity
@@ -49,12 +60,12 @@ KINDS: Mapping[str, SampleKind] = {
 }
 _DESCRIPTIONS = {
     "session": "number of the recording, from 1; a run that was resumed has several",
-    "frame": "number of the frame, which grows also where the robot restarts",
-    "t_s": "mission time of the sample",
+    "frame": "number of the frame in its recording, which grows also where the robot restarts",
+    "t_s": "mission time of the run at the sample",
 }
 
 
-def samples(name: str, sessions: Iterable[Iterable[RecordedFrame]], kinds: Mapping[str, SampleKind]) -> Table:
+def samples(name: str, sessions: Iterable[SessionFrames], kinds: Mapping[str, SampleKind]) -> Table:
     """The samples of one kind, in the order in which they were received, with session, frame and mission time.
 
     Raises ValueError: there is no such kind.
@@ -63,9 +74,9 @@ def samples(name: str, sessions: Iterable[Iterable[RecordedFrame]], kinds: Mappi
     if kind is None:
         raise ValueError(f"no samples named {name!r}; there are {', '.join(kinds)}")
     rows = (
-        (number, frame.number, frame.t_s + t_s - frame.sensors.t, *values)
-        for number, frames in enumerate(sessions, start=1)
-        for frame in frames
+        (session.number, frame.number, session.offset_s + frame.t_s + t_s - frame.sensors.t, *values)
+        for session in sessions
+        for frame in session.frames
         for t_s, *values in kind.rows(frame)
     )
     return table_of_rows(("session", "frame", "t_s", *kind.names[1:]), rows, _DESCRIPTIONS, kind.texts)

@@ -1,25 +1,27 @@
 """A survey that is simulated in this process, with the same tables as one that was recorded."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from ccatp import __version__
 from ccatp.analysis.run import ALARM_COLUMNS
-from ccatp.analysis.samples import KINDS
+from ccatp.analysis.samples import KINDS, SessionFrames
 from ccatp.analysis.survey import SurveyRun
 from ccatp.analysis.table import table_of_records
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.core import NO_CAUSE, Cause
+from ccatp.core import NO_CAUSE, Cause, Fix
 from ccatp.daemon.loops.mission_runner import TimedFrame
 from ccatp.daemon.operator.alarms import LASTING, LEAST_S, active_cause
 from ccatp.errors import ExitStatus
 from ccatp.links.robot_codec import decode_from_robot, encode
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import ArrivalMessage, MissionStatus
+from ccatp.links.topics import ArrivalMessage, FixMessage, MissionStatus
 from ccatp.records.run_reader import RecordedFrame
 from ccatp.records.store import StoredPoint, planned_point
 from ccatp.report.findings import findings_of
@@ -27,6 +29,7 @@ from ccatp.report.record import RecordedSession, SurveyFiles, changed_from_shipp
 from ccatp.sim.fault_plan import FaultPlan, read_plan
 from ccatp.studies.sil_run import SilResult, SilRun
 from ccatp.survey.behaviours import MissionCommand
+from ccatp.survey.fix_review import ReviewedFix
 from ccatp.survey.route_follower import StateEstimate
 
 
@@ -64,7 +67,9 @@ class _ObservedRun(SilRun):
         super().__init__(cfg, faults)
         self._keeps_samples = keep_samples
         self._lines: list[tuple[int, float, bytes]] = []
+        self._times_s: list[float] = []
         self._sigmas_m: list[float] = []
+        self._fixes: list[FixMessage] = []
         self._arrivals: list[ArrivalMessage] = []
         self._alarms: list[dict[str, object]] = []
         self._cause = NO_CAUSE
@@ -78,11 +83,12 @@ class _ObservedRun(SilRun):
             self._lines.append((sensors.seq, sensors.t + self._time.offset_s, encode(sensors)))
         verdict = self._verdict
         if verdict is not None and verdict.cause.condition != self._cause.condition:
-            self._note_alarm(verdict.cause, sensors.t)
+            self._note_alarm(verdict.cause, sensors.t + self._time.offset_s)
 
     def _publish(self, frame: TimedFrame) -> None:
         """Keep pose and sigma of one moment: a fix later in the frame changes both."""
         super()._publish(frame)
+        self._times_s.append(frame.t_s)
         self._sigmas_m.append(self.localizer.position_sigma_m)
 
     def _note_alarm(self, cause: Cause, t_s: float) -> None:
@@ -103,9 +109,23 @@ class _ObservedRun(SilRun):
             message = ArrivalMessage(seq=seq, t_s=motion.t_s, point=command.arrived, error_mm=float("nan"))
             self._arrivals.append(message)
 
+    def _fuse(self, fix: Fix) -> ReviewedFix:
+        found, point = super()._fuse(fix), self.mission.state.measuring_point
+        message = FixMessage(
+            seq=self.robot.delivered_seq,
+            point=None if point is None else (*point,),
+            is_fused=not found.doubt,
+            jump_mm=1e3 * found.jump_m,
+            is_set_aside=found.is_set_aside,
+            **asdict(fix),
+        )
+        self._fixes.append(msgspec.structs.replace(message, t_s=fix.t_s + self._time.offset_s))
+        return found
+
     def observed(self, result: SilResult) -> SurveyRun:
         """The tables of the run."""
-        cfg, state, estimates = self.cfg, self.mission.state, self.trace.estimates()
+        cfg, state = self.cfg, self.mission.state
+        estimates = self.trace.estimates()._replace(t_s=np.array(self._times_s))
         status = MissionStatus(
             seq=0,
             t_s=result.mission_time_s,
@@ -117,12 +137,14 @@ class _ObservedRun(SilRun):
         )
         session = RecordedSession(
             name="simulation",
+            number=1,
+            offset_s=0.0,
             version=__version__,
             track=estimates,
             sigma_m=np.array(self._sigmas_m),
             truth=self.trace.truth(),
             arrivals=tuple(self._arrivals),
-            fixes=(),
+            fixes=tuple(self._fixes),
             statuses=(status,),
             changes=(),
         )
@@ -133,6 +155,7 @@ class _ObservedRun(SilRun):
             changed=changed_from_shipped(cfg),
             is_simulation=True,
             summary=result.summary,
+            recordings=(),
             log=(),
             files={},
             missing=(),
@@ -152,7 +175,7 @@ class _ObservedRun(SilRun):
             warnings=findings.warnings,
             config=cfg,
             alarms=table_of_records(ALARM_COLUMNS, self._alarms),
-            frames=lambda: (self._frames(),),
+            frames=lambda: (SessionFrames(1, 0.0, self._frames()),),
             sample_kinds=KINDS,
             findings=findings,
         )

@@ -17,8 +17,8 @@ from ccatp.report.record import RecordedSession, read_record
 _POINT = ("row", "col", "point", "status", "first_arrival_mm", "measured_at_mm")
 _TRACK = {
     "session": "number of the recording, from 1; a run that was resumed has several",
-    "frame": "number of the frame, which grows also where the robot restarts",
-    "t_s": "mission time",
+    "frame": "number of the frame in its recording, which grows also where the robot restarts",
+    "t_s": "mission time of the run",
     "x_m": "estimated position, deck frame",
     "y_m": "estimated position, deck frame",
     "heading_rad": "estimated heading, deck frame",
@@ -31,7 +31,7 @@ _TRACK = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SurveyRun(Run):
-    """The survey of a mirror. Times are mission time, except those of ``fixes`` and ``alarms``: by the robot's clock.
+    """The survey of a mirror. The times of all tables are mission time of the run.
 
     ``points``: every planned point. ``fixes``: a row for each measured point. ``panels``: position and tilt of each
     planned panel, NaN where its points do not determine it. ``adjuster_moves``: the moves that align the others.
@@ -51,7 +51,7 @@ class SurveyRun(Run):
         """The fix of each measured point, with covariance, deviation from the ideal surface, and channels."""
         table = tables.fixes_table(self.findings)
         columns = {name: text for name, text in table.columns.items() if name not in ("status", "first_arrival_mm")}
-        return table_of_records(columns, [row for row in table.rows if "t_s" in row])
+        return table_of_records(columns, [row for row in table.rows if "x_m" in row])
 
     @cached_property
     def panels(self) -> Table:
@@ -67,23 +67,25 @@ class SurveyRun(Run):
 
     def track(self) -> Table:
         """Estimated and true pose of each frame, deck frame."""
-        sessions = [_track(number, one) for number, one in enumerate(self.findings.record.sessions, start=1)]
+        sessions = [_track(one) for one in self.findings.record.sessions]
         rows = np.concatenate(sessions) if sessions else np.empty((0, len(_TRACK)))
         whole = {name: rows[:, at].astype(np.int64) for at, name in enumerate(("session", "frame"))}
         return Table({name: whole.get(name, rows[:, at]) for at, name in enumerate(_TRACK)}, _TRACK)
 
 
-def _track(number: int, session: RecordedSession) -> FloatArray:
+def _track(session: RecordedSession) -> FloatArray:
     track, truth = session.track, np.full((len(session.track.seq), 3), np.nan)
     if session.truth is not None:
         _, ours, theirs = np.intersect1d(track.seq, session.truth.seq, assume_unique=True, return_indices=True)
         truth[ours] = session.truth.pose[theirs]
-    return np.column_stack([np.full(len(truth), number), track.seq, track.t_s, track.pose, session.sigma_m, truth])
+    numbers, times_s = np.full(len(truth), session.number), track.t_s + session.offset_s
+    return np.column_stack([numbers, track.seq, times_s, track.pose, session.sigma_m, truth])
 
 
 def open_survey(run_dir: Path) -> SurveyRun:
     """The survey of a run directory; errors as ``open_run``."""
     findings = findings_of(read_record(run_dir))
     record = findings.record
-    fields = shared_fields(run_dir, record) | {"warnings": (*record.missing, *findings.warnings)}
+    statuses = [(one.t_s + session.offset_s, one) for session in record.sessions for one in session.statuses]
+    fields = shared_fields(run_dir, record, statuses) | {"warnings": (*record.missing, *findings.warnings)}
     return SurveyRun(config=record.cfg, findings=findings, sample_kinds=KINDS, **fields)

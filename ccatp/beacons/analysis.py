@@ -71,7 +71,8 @@ class BeaconRun(Run):
 def open_beacons(run_dir: Path) -> BeaconRun:
     """The mission of a run directory; errors as ``ccatp.open_run``."""
     record = read_beacon_record(run_dir)
-    return BeaconRun(config=record.cfg, record=record, sample_kinds=SAMPLES, **shared_fields(run_dir, record))
+    statuses = [(status.t_s, status) for status in record.statuses]
+    return BeaconRun(config=record.cfg, record=record, sample_kinds=SAMPLES, **shared_fields(run_dir, record, statuses))
 
 
 # -- samples ----------------------------------------------------------------------------------------------------------

@@ -39,11 +39,18 @@ class LogLine(NamedTuple):
 
 
 class ReadLine(NamedTuple):
-    """A parsed line: text for a reader (None for debugging), change of state, and whether a session begins."""
+    """A parsed line: text for a reader (None for debugging), change of state, whether a session begins or ends."""
 
     shown: LogLine | None
     change: StateChange | None
     begins: bool
+    ends: bool = False
+
+
+def is_in_progress(lines: Iterable[ReadLine]) -> bool:
+    """Whether a session began and has not ended: the run is in progress, or was killed."""
+    marks = [line.begins for line in lines if line.begins or line.ends]
+    return bool(marks) and marks[-1]
 
 
 def read_log(path: Path, warnings: list[str]) -> Iterator[ReadLine]:
@@ -74,12 +81,12 @@ def _parsed(text: str) -> ReadLine | None:
         return None
     process = str(fields.get("logger", fields.get(_OLD_LOGGER, "")))
     event = fields["event"] = _OLD_EVENTS.get(fields["event"], fields["event"])
-    begins = event == "run_started" and process == "supervisor"
+    begins, ends = (event == name and process == "supervisor" for name in ("run_started", "run_finished"))
     if fields.get("level") == _DEBUG:
         change = None
         if event == "state_changed" and isinstance(fields.get("seq"), int):
             change = StateChange(fields["seq"], str(fields.get("before")), str(fields.get("after")))
-        return ReadLine(None, change, begins)
+        return ReadLine(None, change, begins, ends)
     t_s = fields.get("t_s")
     line = LogLine(
         wall=str(fields.get("timestamp", fields.get(_OLD_TIME, ""))),
@@ -88,7 +95,7 @@ def _parsed(text: str) -> ReadLine | None:
         process=process,
         text=_text(fields),
     )
-    return ReadLine(line, None, begins)
+    return ReadLine(line, None, begins, ends)
 
 
 def _text(fields: dict[str, Any]) -> str:

@@ -23,7 +23,8 @@ from ccatp.records.summary import arrival_error_m, distribution, measured_error_
 from ccatp.records.timeline import common_rows, row_before, rows_of
 from ccatp.report.network import remarks
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, SurveyFiles
-from ccatp.survey.ending import ending_of, read_ending, why_text
+from ccatp.survey.ending import End, ending_of, read_ending, why_text
+from ccatp.survey.events import SurveyOutcome
 from ccatp.survey.fix_gate import nis_of
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import ORDERS, plan_survey
@@ -105,6 +106,17 @@ def first_arrivals_mm(record: SurveyFiles) -> dict[PointId, float]:
                     first[point] = 1e3 * arrival_error_m(mirror, point, truth.place[at], height_m)
         found = first | found
     return found
+
+
+def fix_times_s(record: SurveyFiles) -> dict[PointId, float]:
+    """Time of the run at which each fix that counts was taken, s; without those whose recording is not there."""
+    counted = {(one.point, one.fix.position_m) for one in record.measured}
+    return {
+        PointId(*fix.point): fix.t_s + session.offset_s
+        for session in record.sessions
+        for fix in session.fixes
+        if fix.point is not None and (PointId(*fix.point), fix.position_m) in counted
+    }
 
 
 def _reasons(record: SurveyFiles) -> dict[PointId, str]:
@@ -423,13 +435,23 @@ def coverage_of(found: Findings) -> dict[str, int]:
 
 # Log line of the supervisor at the end of a complete mission.
 _FINISHED = "run finished: status 0"
+_OUTCOMES = {
+    End.COMPLETE: COMPLETE,
+    End.AT_BASE: SurveyOutcome.AT_BASE,
+    End.STOPPED: SurveyOutcome.STOPPED,
+    End.FAULTED: "ended with a fault",
+    End.INTERRUPTED: "interrupted",
+    End.FAILED: "failed",
+}
 
 
 def outcome_of(record: SurveyFiles) -> PointOutcome:
-    """Outcome of the run by the last status, otherwise by the log; without both it is running or was killed."""
+    """Outcome of the run by its summary, otherwise by the last status or the log; without all it runs or was killed."""
     status = record.last_status
+    if (known := read_ending(record.summary)) is not None:
+        return PointOutcome(_OUTCOMES[known.what], why_text(known), known.what is End.COMPLETE, known.alarms)
     if status is not None and (status.outcome or status.exit_status >= 0):
-        ending = read_ending(record.summary) or ending_of(status, ExitStatus(max(status.exit_status, 0)))
+        ending = ending_of(status, ExitStatus(max(status.exit_status, 0)))
         text = status.outcome or f"ended with status {status.exit_status}, {status.state}"
         return PointOutcome(text, why_text(ending), is_good=status.outcome == COMPLETE, alarms=ending.alarms)
     if record.log and record.log[-1].text == _FINISHED:

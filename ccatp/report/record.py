@@ -32,7 +32,8 @@ from ccatp.records.run_reader import (
     read_truth,
     trace_of_truth,
 )
-from ccatp.records.state_log import LogLine, StateChange, changes_of, read_log
+from ccatp.records.run_time import RecordingPlace, places_of
+from ccatp.records.state_log import LogLine, StateChange, changes_of, is_in_progress, read_log
 from ccatp.records.store import StoredPoint, StoreError, read_survey
 from ccatp.records.timeline import Timeline, first_of_each, iter_places, read_timeline
 from ccatp.survey.ending import AlarmAtEnd
@@ -51,6 +52,8 @@ class RecordedSession:
     """
 
     name: str
+    number: int  # of the recording, from 1
+    offset_s: float  # time of the run less mission time of the recording
     version: str
     track: Trace  # the estimates
     sigma_m: FloatArray  # largest standard deviation of the place in any direction, shape (k,)
@@ -84,6 +87,7 @@ class RunFiles:
     changed: Mapping[str, tuple[object, object]]  # keys that differ from the shipped configuration: both values
     is_simulation: bool | None
     summary: Mapping[str, Any] | None
+    recordings: tuple[RecordingPlace, ...]
     log: tuple[LogLine, ...]
     files: Mapping[str, int]  # sizes in bytes
     missing: tuple[str, ...]  # parts of a complete run that this run lacks, one line each
@@ -135,8 +139,8 @@ def read_record(run_dir: Path) -> SurveyFiles:
     all_changes = changes_of(folder.log, len(found))
     # The log names frames by the robot's own numbers, which are those of the axis until it restarts.
     sessions = [
-        _session(one, mirror, () if one.timeline.has_restart else changes, folder.warnings)
-        for one, changes in zip(found, all_changes, strict=True)
+        _session(one, place, mirror, () if one.timeline.has_restart else changes, folder.warnings)
+        for one, place, changes in zip(found, folder.places, all_changes, strict=True)
         if one is not None
     ]
     if found and folder.log and not all(session.changes for session in sessions):
@@ -204,6 +208,7 @@ class RunFolder:
         self.is_simulation: bool | None = None  # as the last recording says
         self.missing: list[str] = []
         self.warnings: list[str] = []
+        self.places: tuple[RecordingPlace, ...] = ()  # of the recordings that were read
         self.log = [*read_log(run_dir / LOG, self.warnings)]
         if not self.log:
             self.missing.append(f"{LOG}: {log_holds}")
@@ -215,6 +220,7 @@ class RunFolder:
             "is_simulation": self.is_simulation,
             "config_text": (self.run_dir / CONFIG).read_text(encoding="utf-8", errors="replace"),
             "summary": self._summary(self.run_dir / SUMMARY),
+            "recordings": self.places,
             "log": tuple(line.shown for line in self.log if line.shown is not None),
             # The report is not part of the run, so that a repeated report is the same.
             "files": {
@@ -229,7 +235,12 @@ class RunFolder:
     def _summary(self, path: Path) -> Mapping[str, Any] | None:
         try:
             if isinstance(found := json.loads(read_text(path)), dict):
-                return found
+                if not is_in_progress(self.log):
+                    return found
+                self.missing.append(
+                    f"{path.name}: it is of an earlier session; the last one is in progress or was killed"
+                )
+                return None
             self.warnings.append(f"{path.name}: is no summary")
         except FileNotFoundError:
             self.missing.append(f"{path.name}: the run is in progress, or was killed before its end")
@@ -247,7 +258,10 @@ class RunFolder:
         paths = recordings(self.run_dir / TELEMETRY)
         if not paths:
             self.missing.append(f"{TELEMETRY}: {holds}")
-        return [self._recording(path, topics, columns) for path in paths]
+        found = [self._recording(path, topics, columns) for path in paths]
+        timelines = (None if one is None else one.timeline for one in found)
+        self.places = places_of(zip((path.name for path in paths), timelines, strict=True))
+        return found
 
     def _recording(self, path: Path, topics: Iterable[str], columns: Mapping[str, int]) -> RecordedMessages | None:
         found: dict[str, list[Any]] = {topic: [] for topic in topics}
@@ -291,7 +305,11 @@ _COLUMNS = {"track": 8, "truth": 11}
 
 
 def _session(
-    found: RecordedMessages, mirror: Mirror, changes: Sequence[StateChange], warnings: list[str]
+    found: RecordedMessages,
+    place: RecordingPlace,
+    mirror: Mirror,
+    changes: Sequence[StateChange],
+    warnings: list[str],
 ) -> RecordedSession:
     messages = found.messages
     track, truth = (joined(messages[topic], count, count) for topic, count in _COLUMNS.items())
@@ -302,6 +320,8 @@ def _session(
         track, deck = track[:0], np.empty((0, 4))
     return RecordedSession(
         name=found.name,
+        number=place.number,
+        offset_s=place.offset_s,
         version=found.version,
         track=Trace(track[:, 0].astype(np.int64), track[:, 1], deck[:, :3], deck[:, 3]),
         sigma_m=track[:, 7],

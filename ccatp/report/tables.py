@@ -17,7 +17,7 @@ from ccatp.mirror.adjuster_work import Step
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import PanelResult, adjuster_places
 from ccatp.report.alignment import panel_data, worst_corner
-from ccatp.report.findings import Findings, metadata_of
+from ccatp.report.findings import Findings, fix_times_s, metadata_of
 
 FILE_MODE = 0o644
 _UNITS = frozenset(("um", "urad", "mm", "m", "m2", "s"))
@@ -33,7 +33,7 @@ _FIXES = {
     **_PLACE,
     "point": "number of the point on its panel",
     "status": "planned, measured or skipped",
-    "t_s": "time of the fix, clock of the robot",
+    "t_s": "mission time of the run at the fix; unknown if its recording is not there",
     **{f"{axis}_m": f"retroreflector, {axis} in the world frame" for axis in "xyz"},
     **dict.fromkeys(_COVARIANCE, "covariance of the retroreflector, world frame"),
     "dop": "dilution of precision",
@@ -116,7 +116,7 @@ def _yaml(value: object) -> str:
 def fixes_table(found: Findings) -> ColumnTable:
     """Every point of the mission, measured or not."""
     record, alignment = found.record, found.alignment
-    fixes = {one.point: one.fix for one in record.measured}
+    fixes, times_s = {one.point: one.fix for one in record.measured}, fix_times_s(record)
     deviations = {
         PointId(*panel.panel, one["point"]): one
         for panel in (() if alignment is None else alignment.panels)
@@ -127,7 +127,7 @@ def fixes_table(found: Findings) -> ColumnTable:
         row: dict[str, object] = {**stored.point._asdict(), "status": stored.status}
         row |= {"first_arrival_mm": arrival.first_mm, "measured_at_mm": arrival.left_mm}
         if (fix := fixes.get(stored.point)) is not None:
-            row |= {"t_s": fix.t_s, "dop": fix.dop, "residual_rms_m": fix.residual_rms_m}
+            row |= {"t_s": times_s.get(stored.point), "dop": fix.dop, "residual_rms_m": fix.residual_rms_m}
             row |= zip(("x_m", "y_m", "z_m"), fix.position_m, strict=True)
             row |= {name: fix.covariance_m2[at] for name, at in _COVARIANCE.items()}
             row |= {"channels": _list(fix.channels), "metrology": fix.metrology, "left_out": _list(fix.left_out)}
@@ -181,7 +181,7 @@ def panel_table(mirror: Mirror, panels: Sequence[PanelResult]) -> ColumnTable:
 
 
 def all_panels_table(found: Findings) -> ColumnTable:
-    """Every panel that has measured points; one that they do not determine has its place and their number."""
+    """Panels with measured points: of one that they do not determine only its place and the number of its points."""
     result = found.alignment
     table = panel_table(found.record.mirror, () if result is None else result.panels)
     others = () if result is None else result.undetermined

@@ -132,9 +132,33 @@ def test_alarms_are_rows_with_their_end_and_who_acknowledged_them(spoilt: Path) 
     (spoilt / ALARMS_FILE).unlink(missing_ok=True)
     (spoilt / ALARMS_FILE).write_text("".join(json.dumps({"name": "few", **event}) + "\n" for event in events))
     first, second = ccatp.open_run(spoilt).alarms
-    assert (first["severity"], first["cause"], first["raised_t_s"]) == ("hold", "fewer", 1.0)
+    assert (first["severity"], first["cause"]) == ("hold", "fewer")
+    assert np.isnan([first["raised_t_s"], first["ended_t_s"]]).all()  # no recorded status has it
     assert (first["ended_utc"], first["acknowledged_by"]) == ("2026-01-01T02Z", "B")
     assert (second["severity"], second["ended_utc"], second["acknowledged_by"]) == ("slow", "", "")
+
+
+def test_all_tables_of_a_resumed_run_have_one_axis_of_time(recorded: Path, spoilt: Path, survey: SurveyRun) -> None:
+    """The second recording begins again with the frames and times of the robot of the first."""
+    (spoilt / "telemetry.1.mcap").hardlink_to(recorded / "telemetry.mcap")
+    run = ccatp.open_run(spoilt)
+    assert isinstance(run, SurveyRun)
+    track, imu, gyroscope = run.track(), run.samples("imu"), survey.samples("imu")
+    assert (np.diff(track["t_s"]) > 0.0).all()
+    for table in (track, imu):
+        assert set(table["session"]) == {1, 2}
+    begin_s = track["t_s"][track["session"] == 2][0]
+    later = imu["t_s"][imu["session"] == 2]
+    assert later == pytest.approx(gyroscope["t_s"] + begin_s - survey.track()["t_s"][0])
+    assert run.fixes["t_s"] == pytest.approx(survey.fixes["t_s"] + begin_s - survey.track()["t_s"][0])
+
+
+def test_a_fix_without_its_recording_has_no_time(recorded: Path, spoilt: Path) -> None:
+    (spoilt / "telemetry.mcap").unlink()
+    run = ccatp.open_run(spoilt)
+    assert isinstance(run, SurveyRun)
+    assert len(run.fixes) == 9
+    assert np.isnan(run.fixes["t_s"]).all()
 
 
 def test_a_run_in_progress_or_without_some_files_opens_and_says_what_is_missing(spoilt: Path) -> None:

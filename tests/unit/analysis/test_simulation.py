@@ -51,6 +51,21 @@ def test_points_panels_and_samples(run: SurveyRun) -> None:
     assert likeness[0] > 0.9 > likeness[1]  # also in the noise of the hard world, and at no other time
 
 
+def test_times_of_all_tables_agree_where_the_clock_of_the_robot_is_set_back(tmp_path: Path) -> None:
+    """By the truth: the robot stands where a fix is taken, and the gyroscope sees its turns."""
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[[fault]]\nsignal = "clock"\ntype = "jump"\nat_s = 30.0\nby_s = -25.0\n')
+    run = ccatp.simulate(mirror="fyst-m2", seed=4, world="thesis", panels=1, faults=plan)
+    track, imu, fixes = run.track(), run.samples("imu"), run.fixes
+    assert (np.diff(track["t_s"]) > 0.0).all()
+    turned_rad = np.interp(imu["t_s"], track["t_s"], np.unwrap(track["true_heading_rad"]))
+    assert np.abs(np.cumsum(imu["wz_rad_s"] * 0.01) - (turned_rad - turned_rad[0])).max() < 0.02  # noise of a minute
+    assert fixes["t_s"].max() > 40.0
+    for fix_s in fixes["t_s"]:
+        standing = (track["t_s"] > fix_s - 0.1) & (track["t_s"] <= fix_s)
+        assert np.ptp(track["true_x_m"][standing]) < 1e-3  # the robot stands, which drives 0.01 m in this time
+
+
 def test_pose_and_sigma_of_a_row_belong_to_one_moment(run: SurveyRun) -> None:
     """A fix moves the pose by many of the sigmas that it leaves."""
     track = run.track()
