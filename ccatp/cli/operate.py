@@ -73,7 +73,8 @@ _COMPARED = """
 \b
 abort      the robot drives home; the run ends there, status 3
 stop       the robot stays where it is; the run ends at once, status 4
-emergency  the robot drives home, or stands in an earthquake; latched until the observatory clears it
+emergency  the robot drives home, or stands in an earthquake; latched until
+           it is cleared
 pause      the robot stays where it is until resume; a new emergency or a
            low battery sends it home all the same
 """
@@ -91,7 +92,7 @@ def _operator_command(name: str, help_text: str) -> click.Command:
 
 pause = _operator_command("pause", f"Stop the robot where it is, until resume.{_COMPARED}")
 resume = _operator_command("resume", "Continue after a pause, or after a fault whose cause is gone.")
-abort = _operator_command("abort", f"Give up the survey and drive the robot to its base.{_COMPARED}")
+abort = _operator_command("abort", f"End the survey and drive the robot to its base.{_COMPARED}")
 stop = _operator_command("stop", f"Hold the wheels where the robot is, save, and end the daemon.{_COMPARED}")
 
 OBSERVATORY_OPTIONS = common.options(
@@ -159,7 +160,7 @@ def _ask_observatory(
 def alarms(
     context: click.Context, config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool
 ) -> None:
-    """Show the alarms of the running daemon: how grave, since when, why, and what to do.
+    """Show the alarms of the running daemon: severity, start time, cause, and what to do.
 
     An alarm that held the robot or sent it home stays in the list until it is acknowledged.
     """
@@ -213,7 +214,7 @@ def _alarm_lines(alarm: Mapping[str, Any], latched: Sequence[Mapping[str, str]])
 @click.argument("name")
 @DAEMON_OPTIONS
 def ack(name: str, config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
-    """Acknowledge the alarm NAME: someone knows of it and sees to it. That releases no hold."""
+    """Acknowledge the alarm NAME: somebody takes care of it. That releases no hold."""
     folder = common.configured_folder(config_file, runtime_dir)
     reply = _ask(folder, "acknowledge", timeout_s, name=name, by=_user())
     _print_reply(reply if json_output else {"ok": True}, json_output)
@@ -225,7 +226,7 @@ def ack(name: str, config_file: Path | None, runtime_dir: Path | None, timeout_s
 @common.RUNTIME_DIR_OPTION
 @common.json_option("The events as JSON on standard output.")
 def history(run_dir: Path | None, config_file: Path | None, runtime_dir: Path | None, json_output: bool) -> None:
-    """Show what happened to the alarms of the running daemon, or of the run in RUN_DIR, oldest first."""
+    """Show the events of the alarms of the running daemon, or of the run in RUN_DIR, oldest first."""
     from ccatp.daemon.operator.alarms import read_history
     from ccatp.daemon.supervision.process import run_dir_in
     from ccatp.links.runtime_dir import runtime_dir_path
@@ -247,10 +248,10 @@ def history(run_dir: Path | None, config_file: Path | None, runtime_dir: Path | 
 
 @common.command("ccatp status", "ccatp status --watch", "ccatp status --watch --json | jq -c .status.done")
 @DAEMON_OPTIONS
-@click.option("--watch", is_flag=True, help="Go on until the run is over; with --json one answer a line.")
+@click.option("--watch", is_flag=True, help="Repeat until the run has ended; with --json one answer a line.")
 @click.option(
     "--every", "period_s", type=click.FloatRange(0.1, 3600.0), default=1.0, show_default=True, metavar="SECONDS",
-    help="With --watch: look this often.",
+    help="With --watch: period of the answers.",
 )  # fmt: skip
 def status(
     config_file: Path | None, runtime_dir: Path | None, timeout_s: float, watch: bool, period_s: float,

@@ -18,7 +18,7 @@ FOXGLOVE_PORT = 8765
 @common.WORLD_OPTIONS
 @common.PANELS_OPTION
 @common.key_option("--filter", "run.filter", metavar="NAME", help="State estimator: kf, ekf or ukf.")
-@click.option("--realtime", is_flag=True, help="Pace the simulation on the wall clock.")
+@click.option("--realtime", is_flag=True, help="Pace the simulation on the wall clock; --resume keeps it.")
 @common.key_option(
     "--physics",
     "sim.robot.physics",
@@ -62,7 +62,7 @@ def run(
     permit_open_files()
     # From here on it imports at the same time as this process.
     fork_server = click.get_current_context().with_resource(ForkServer())
-    from ccatp.daemon.supervision.run_dir import RunOptions, find_unfinished
+    from ccatp.daemon.supervision.run_dir import RunOptions, find_unfinished, with_origin
 
     if resume and run_dir is None:
         run_dir = find_unfinished()
@@ -70,15 +70,16 @@ def run(
         config_file = run_dir / "config.toml"
     from ccatp.daemon.supervision.supervisor import run as run_to_the_end
 
-    if faults_file is not None:
-        from ccatp.sim.fault_plan import read_plan
-
-        read_plan(faults_file, lockstep=not realtime)  # mistakes are reported before anything is started
     options = RunOptions(
         sim=sim, config_file=config_file, overrides=settings, realtime=realtime, run_dir=run_dir, resume=resume,
         held=held, recover=recover, json_output=json_output, runtime_dir=runtime_dir, faults_file=faults_file,
         verbosity=verbose - quiet,
     )  # fmt: skip
+    if faults_file is not None:
+        from ccatp.sim.fault_plan import read_plan
+
+        # Mistakes are reported before anything is started.
+        read_plan(faults_file, lockstep=not with_origin(options).realtime)
     return int(run_to_the_end(options, fork_server))
 
 

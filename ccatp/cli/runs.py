@@ -20,7 +20,7 @@ FILES = {
     "mission.sqlite": "points and fixes",
     "telemetry.mcap": "recording, for ccatp replay, Foxglove and PlotJuggler",
     "log.jsonl": "log of all processes",
-    "alarms.jsonl": "what happened to the alarms",
+    "alarms.jsonl": "events of the alarms",
     "config.toml": "the exact configuration",
     "checkpoint": "state of a mission that can be resumed",
     "faults.toml": "faults that were injected",
@@ -84,16 +84,14 @@ def show(run_dir: Path, json_output: bool) -> None:
     "older_than_days",
     type=click.FloatRange(min=0.0),
     metavar="DAYS",
-    help="The runs in --folder that nothing has changed for so many days.",
+    help="The runs in --folder without a change for this many days.",
 )
-@click.option(
-    "--keep", type=click.IntRange(min=0), metavar="N", help="The runs in --folder, except the N newest of all."
-)
+@click.option("--keep", type=click.IntRange(min=0), metavar="N", help="The runs in --folder, except the N newest ones.")
 @click.option(
     "--folder", type=common.PATH, default="runs", show_default=True, help="Where --older-than and --keep look."
 )
 @click.option("--yes", is_flag=True, help="Do not ask.")
-@click.option("--force", is_flag=True, help="Remove a named RUN_DIR also if it could be resumed.")
+@click.option("--force", is_flag=True, help="Remove a named RUN_DIR also if it can be resumed.")
 @common.JSON_OPTION
 def remove_runs(
     run_dirs: tuple[Path, ...], older_than_days: float | None, keep: int | None, folder: Path, yes: bool, force: bool,
@@ -101,8 +99,8 @@ def remove_runs(
 ) -> None:  # fmt: skip
     """Remove run directories: those named, or old ones.
 
-    A run that goes on is never removed, and one that could be resumed only if it is named with --force. Links, and
-    folders that are no run, are refused.
+    A run in progress is never removed, and one that can be resumed only if it is named with --force. Links, and folders
+    that are no run, are refused.
     """
     from ccatp.daemon.supervision import run_removal as removal
 
@@ -135,15 +133,19 @@ def _facts(run_dir: Path) -> dict[str, Any]:
     """The facts of one run; an unknown value is an empty text."""
     from ccatp.config.messages import parse_toml
     from ccatp.links.runtime_dir import RUN_LOCK, is_held
+    from ccatp.survey.ending import read_ending
 
     events = list(_events(run_dir / "log.jsonl"))
     begun = next((event for event in events if event.get("event") == "run_started"), {})
-    ended: dict[str, Any] = next((event for event in reversed(events) if event.get("event") == "run_finished"), {})
-    summary = _read_json(run_dir / "summary.json")
-    points, origin = summary.get("points", {}), _read_json(run_dir / "origin.json")
+    last: dict[str, Any] = next(
+        (one for one in reversed(events) if one.get("event") in ("run_started", "run_finished")), {}
+    )
+    summary, origin = _read_json(run_dir / "summary.json"), _read_json(run_dir / "origin.json")
+    ended, points = dict[str, Any](), dict[str, Any]()
     state = "running" if is_held(run_dir / RUN_LOCK) else "not finished"
-    if ended and state != "running":
-        state = ExitStatus(ended["status"]).name.lower()
+    if last.get("event") == "run_finished" and state != "running":  # otherwise the summary is of an earlier session
+        ended, points, ending = last, summary.get("points", {}), read_ending(summary)
+        state = ExitStatus(last["status"]).name.lower() if ending is None else ending.what.replace("_", " ")
     try:
         system = parse_toml((run_dir / "config.toml").read_text(encoding="utf-8"), "").get("system", "")
     except (ConfigError, OSError, UnicodeDecodeError):

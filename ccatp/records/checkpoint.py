@@ -114,7 +114,7 @@ def read_checkpoint(path: Path, kind: type[Record]) -> Record | None:
     try:
         found = msgspec.msgpack.decode(max(slots)[1], type=kind)
     except msgspec.MsgspecError as error:
-        raise CheckpointError(f"{path}: of another version of ccatp ({error}), {AT_BASE}") from error
+        raise CheckpointError(f"{path}: written by a version of ccatp with another format, {AT_BASE}") from error
     # The first record is in the second slot, so that a shorter file was cut off and may have lost the newest record.
     if len(data) <= _SLOT_BYTES:
         raise CheckpointError(f"{path}: cut off, {AT_BASE}")

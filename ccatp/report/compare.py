@@ -1,4 +1,4 @@
-"""Two surveys beside each other, called A and B: what changed on the mirror, the page, lines for a terminal, data."""
+"""Comparison of two surveys, A and B: what changed on the mirror, the page, lines for a terminal, data."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -79,12 +79,15 @@ _TEXTS = {
 
 def ending_of(status: MissionStatus | None, exit_status: ExitStatus, *, failure: str = "") -> Ending:
     """The end of a run with its last status; ``failure``: of a process that ended the run by its death."""
-    if failure or status is None:
-        is_signal = exit_status is ExitStatus.INTERRUPTED
-        return Ending(End.INTERRUPTED, By.SIGNAL) if is_signal else Ending(End.FAILED, By.PROGRAM, cause=failure)
     alarms = tuple(
-        AlarmAtEnd(one.name, one.severity, one.cause, one.acknowledged_by) for one in status.alarms if not one.ended
+        AlarmAtEnd(one.name, one.severity, one.cause, one.acknowledged_by)
+        for one in (() if status is None else status.alarms)
+        if not one.ended
     )
+    if failure or status is None:
+        if exit_status is ExitStatus.INTERRUPTED:
+            return Ending(End.INTERRUPTED, By.SIGNAL, alarms=alarms)
+        return Ending(End.FAILED, By.PROGRAM, cause=failure, alarms=alarms)
     what = _OUTCOMES.get(status.outcome)
     if what is None:
         what = {ExitStatus.HELD: End.FAULTED, ExitStatus.INTERRUPTED: End.INTERRUPTED}.get(exit_status, End.FAILED)

@@ -232,7 +232,7 @@ def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> Non
 
 
 def with_origin(options: RunOptions) -> RunOptions:
-    """The options with ``sim`` as the resumed run began.
+    """The options with ``sim`` as the resumed run began, and in real time if it began so.
 
     ConfigError: it began with a real robot, and a simulation is requested.
     """
@@ -240,7 +240,8 @@ def with_origin(options: RunOptions) -> RunOptions:
         return options
     if options.sim and not began:
         raise ConfigError(f"--sim: the run in {options.run_dir} is of a real robot; leave --sim out to resume it")
-    return replace(options, sim=began)
+    was_realtime = _read_origin(options.run_dir).get("realtime") is True
+    return replace(options, sim=began, realtime=options.realtime or was_realtime)
 
 
 def _began_simulated(run_dir: Path) -> bool | None:
@@ -279,10 +280,11 @@ def read_run_id(run_dir: Path) -> str:
     return str(_read_origin(run_dir).get("run_id", ""))
 
 
-def keep_origin(run_dir: Path, *, is_sim: bool, is_new: bool) -> None:
-    """Save the id of a run, and whether it is simulated, for ``with_origin``; a resumed run keeps its id."""
+def keep_origin(run_dir: Path, *, is_sim: bool, is_realtime: bool, is_new: bool) -> None:
+    """Save the id of a run, and how it is simulated, for ``with_origin``; a resumed run keeps its id."""
     run_id = uuid4().hex if is_new else read_run_id(run_dir)
-    write_durably(run_dir / ORIGIN_FILE, json.dumps({"simulation": is_sim, "run_id": run_id}).encode())
+    origin = {"simulation": is_sim, "realtime": is_realtime, "run_id": run_id}
+    write_durably(run_dir / ORIGIN_FILE, json.dumps(origin).encode())
 
 
 def check_takes_faults(kind: MissionKind, faults_file: Path | None) -> None:

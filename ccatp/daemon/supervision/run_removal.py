@@ -25,7 +25,7 @@ def refusal(run_dir: Path, *, force: bool) -> str | None:
     if not (run_dir / CONFIG).is_file() or not any((run_dir / name).is_file() for name in _OF_A_RUN):
         return f"is no run directory (it needs {CONFIG}, and {', '.join(_OF_A_RUN[:-1])} or {_OF_A_RUN[-1]})"
     if any(is_held(run_dir / name) for name in (RUN_LOCK, CHILDREN_LOCK)):
-        return "is in use: the run goes on, or its processes have not ended"
+        return "is in use: the run is in progress, or its processes have not ended"
     if not force and is_resumable(run_dir):
         return "can be resumed; name it with --force to remove it all the same"
     return None

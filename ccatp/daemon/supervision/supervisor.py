@@ -395,7 +395,7 @@ def _run(options: RunOptions, cfg: CommonConfig, fork_server: ForkServer | None 
             count = done["points"]["total"]
             print(f"nothing left to do: all {count} points of {run_dir} are measured", file=sys.stderr)
             return ExitStatus.COMPLETE
-        keep_origin(run_dir, is_sim=options.sim, is_new=not options.resume)
+        keep_origin(run_dir, is_sim=options.sim, is_realtime=options.realtime, is_new=not options.resume)
         write_durably(run_dir / "config.toml", dump_config(cfg).encode())
         (runtime_dir / RUN_DIR_FILE).write_bytes(os.fsencode(run_dir) + b"\n")
         (runtime_dir / ADDRESSES_FILE).write_text(json.dumps(_addresses(cfg)) + "\n", encoding="utf-8")

@@ -133,7 +133,12 @@ class StateCollector(Collector):
         rows = [((alarm["name"], alarm["severity"]), 1.0) for alarm in active]
         yield "alarm", "1 for each active alarm.", ("name", "severity"), rows
         unseen = sum(not alarm["acknowledged_by"] for alarm in state["alarms"])
-        yield "alarms_unacknowledged", "Active, or ended and grave.", (), [((), unseen)]
+        yield (
+            "alarms_unacknowledged",
+            "Alarms that nobody has acknowledged: active, or ended with severity hold or above.",
+            (),
+            [((), unseen)],
+        )
         if mission is not None:
             states = [((known,), known == mission["state"]) for known in self._ground["states"]]
             yield "mission_state", "1 for the state of the mission.", ("state",), states

@@ -52,11 +52,11 @@ class Endpoint(NamedTuple):
 ENDPOINTS = (
     Endpoint("/", "The page.", _TEXT, "text/html"),
     Endpoint("/static/{path}", "A file of the page.", _TEXT, "*/*", errors=(404,)),
-    Endpoint("/ground", "What does not change in a run: map, points, limits, names.", {"type": "object"}),
+    Endpoint("/ground", "Constant data of a run: map, points, limits, names.", {"type": "object"}),
     Endpoint("/events", "Server-sent events: all once, news ten times a second, end.", _TEXT, "text/event-stream"),
-    Endpoint("/status", "All levels of the page, and what is wrong.", _ref("Status")),
+    Endpoint("/status", "All levels of the page, and the trouble.", _ref("Status")),
     Endpoint(
-        "/alarms", "The list of alarms, the gravest first.",
+        "/alarms", "The list of alarms, the most severe first.",
         _object("status", "alarms", status=_OK, alarms={"type": "array", "items": _ref("Alarm")}),
     ),
     Endpoint("/healthz", "Whether both loops report and the robot sends frames.", _DONE, errors=(503,)),
@@ -64,8 +64,8 @@ ENDPOINTS = (
     Endpoint("/openapi.json", "This description.", {"type": "object"}),
     Endpoint("/operator", "The name of the token.", _object("status", "name", status=_OK, name=_TEXT), channel="token"),
     Endpoint("/pause", "Hold the robot where it is.", _DONE, channel="control"),
-    Endpoint("/resume", "Go on.", _DONE, channel="control"),
-    Endpoint("/abort", "Give the survey up and drive home.", _DONE, channel="control"),
+    Endpoint("/resume", "Continue after a pause, or after a fault whose cause is gone.", _DONE, channel="control"),
+    Endpoint("/abort", "End the survey and drive the robot to its base.", _DONE, channel="control"),
     Endpoint("/stop", "Hold the wheels, save, and end the daemon.", _DONE, channel="control"),
     Endpoint(
         f"/{ACKNOWLEDGE}", "Acknowledge an alarm.", _DONE, channel="control", body=_object("name", name=_TEXT),

@@ -527,6 +527,15 @@ def test_runs_with_how_they_ended(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "config.toml                   0.000 MB  the exact configuration\n" in shown
     assert answered(capsys, "runs", "show", killed)["files"]["config.toml"] == 0
     assert "no such folder" in refused(capsys, "runs", "list", str(tmp_path / "none"))
+
+    path = tmp_path / "a" / "summary.json"  # what ended it, not the exit status that it shares with other ends
+    path.write_text(json.dumps({**json.loads(path.read_text()), "ended": {"what": "failed", "by": "program"}}))
+    assert "state           failed\n" in printed(capsys, "runs", "show", tmp_path / "a")
+    with (tmp_path / "a" / "log.jsonl").open("a") as log:  # resumed, then killed: the summary is of before
+        log.write('{"event": "run_started"}\n')
+    shown = printed(capsys, "runs", "show", tmp_path / "a")
+    assert "state           not finished\n" in shown
+    assert "points" not in shown
     assert "no run directory (it has no config.toml)" in refused(capsys, "runs", "show", str(tmp_path))
 
 

@@ -183,19 +183,23 @@ def test_a_run_is_resumed_simulated_or_not_as_it_began(tmp_path: Path) -> None:
     Recorder(tmp_path / TELEMETRY, [], is_simulation=True).close()
     assert with_origin(resumed).sim  # of an older version
     assert read_run_id(tmp_path) == ""
-    keep_origin(tmp_path, is_sim=True, is_new=False)
+    keep_origin(tmp_path, is_sim=True, is_realtime=False, is_new=False)
     assert read_run_id(tmp_path) == ""  # its files have none
-    keep_origin(tmp_path, is_sim=False, is_new=True)
+    keep_origin(tmp_path, is_sim=False, is_realtime=False, is_new=True)
     assert (first := read_run_id(tmp_path))
     assert not with_origin(resumed).sim
     with pytest.raises(ConfigError, match=r"--sim: the run in .* is of a real robot; leave --sim out to resume it"):
         with_origin(replace(resumed, sim=True))
-    keep_origin(tmp_path, is_sim=True, is_new=False)
+    keep_origin(tmp_path, is_sim=True, is_realtime=False, is_new=False)
     assert read_run_id(tmp_path) == first
-    keep_origin(tmp_path, is_sim=True, is_new=True)
+    keep_origin(tmp_path, is_sim=True, is_realtime=False, is_new=True)
     assert read_run_id(tmp_path) != first
     assert with_origin(resumed).sim
     assert not with_origin(replace(resumed, resume=False)).sim
+    assert not with_origin(resumed).realtime
+    assert with_origin(replace(resumed, realtime=True)).realtime
+    keep_origin(tmp_path, is_sim=True, is_realtime=True, is_new=True)
+    assert with_origin(resumed).realtime  # the wall clock of its operators, not the speed of the machine
 
 
 def test_directories_that_cannot_be_used(tmp_path: Path) -> None:
@@ -499,7 +503,7 @@ def test_a_damaged_origin_is_refused(tmp_path: Path, content: bytes) -> None:
     for use in (
         lambda: read_run_id(tmp_path),
         lambda: with_origin(RunOptions(sim=True, run_dir=tmp_path, resume=True)),
-        lambda: keep_origin(tmp_path, is_sim=True, is_new=False),
+        lambda: keep_origin(tmp_path, is_sim=True, is_realtime=False, is_new=False),
     ):
         with pytest.raises(ConfigError, match=r"origin\.json: is empty or damaged; put back a copy"):
             use()

@@ -168,6 +168,37 @@ def test_outcomes(recorded: Path, changes: dict[str, object], outcome: tuple[str
     assert (found.text, found.cause, found.is_good) == outcome
 
 
+@pytest.mark.parametrize(
+    ("ended", "outcome"),
+    [
+        ({"what": "failed", "by": "program", "cause": "main died"}, ("failed", "main died", False)),
+        ({"what": "interrupted", "by": "signal"}, ("interrupted", "by a signal", False)),
+        ({"what": "faulted", "by": "mission", "cause": "stuck"}, ("ended with a fault", "stuck", False)),
+        ({"what": "at_base", "by": "operator", "who": "eva"}, ("aborted, at base", "by eva", False)),
+        ({"what": "complete", "by": "mission"}, ("complete", "", True)),
+    ],
+)
+def test_the_outcome_is_that_of_the_summary_whatever_the_last_status_says(
+    recorded: Path, ended: dict[str, str], outcome: tuple[str, str, bool]
+) -> None:
+    whole = read_record(recorded)
+    (session,) = whole.sessions
+    driving = msgspec.structs.replace(session.statuses[-1], outcome="", exit_status=-1, state="driving", cause="link")
+    cut_off = replace(session, statuses=(driving,))
+    found = outcome_of(replace(whole, sessions=(cut_off,), summary={**(whole.summary or {}), "ended": ended}))
+    assert (found.text, found.cause, found.is_good) == outcome
+
+
+def test_the_summary_of_an_earlier_session_says_nothing_of_one_in_progress(recorded: Path, tmp_path: Path) -> None:
+    for file in recorded.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    with (tmp_path / "log.jsonl").open("a", encoding="utf-8") as log:
+        log.write('{"logger": "supervisor", "event": "run_started", "level": "info"}\n')
+    record = read_record(tmp_path)
+    assert record.summary is None
+    assert [line for line in record.missing if line.startswith("summary.json: it is of an earlier session")]
+
+
 def test_alarms_that_were_active_at_the_end_are_on_the_page(recorded: Path) -> None:
     whole = read_record(recorded)
     ended = {"what": "stopped", "by": "operator", "alarms": [{"name": "lifted", "severity": "hold", "cause": "in air"}]}

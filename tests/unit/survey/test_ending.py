@@ -78,6 +78,8 @@ def test_alarms_that_are_active_at_the_end_are_listed_acknowledged_or_not_and_en
     assert [one.name for one in ending.alarms] == ["encoders_stale", "lifted"]
     assert ending_text(ending).endswith("; alarms active at the end: encoders_stale (hold), lifted (hold)")
     assert read_ending({"ended": msgspec.to_builtins(ending)}) == ending
+    died = ending_of(found, ExitStatus.HELD, failure="dataloop died")  # its death does not end the alarms
+    assert died.alarms == ending.alarms
 
 
 @pytest.mark.parametrize("summary", [None, {}, {"ended": 3}, {"ended": {"what": "vanished", "by": "mission"}}])
