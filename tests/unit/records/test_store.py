@@ -429,7 +429,7 @@ def test_a_record_of_another_version_is_refused(tmp_path: Path, record: object) 
     file = CheckpointFile(path, is_patient=True)
     file.write(record)  # type: ignore[arg-type]
     file.close()
-    refusal = r"^\S*checkpoint: written by a version of ccatp with another format, so the robot's place is not known; set it at base"
+    refusal = r"^\S*checkpoint: written by a version of ccatp with another format, so the robot's place is not known"
     with pytest.raises(CheckpointError, match=refusal):
         read_checkpoint(path, Place)
 
