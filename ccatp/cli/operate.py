@@ -234,7 +234,7 @@ def history(run_dir: Path | None, config_file: Path | None, runtime_dir: Path | 
     if run_dir is None:
         folder = common.configured_folder(config_file, runtime_dir)
         run_dir = run_dir_in(runtime_dir_path(str(folder or ""), os.environ))
-    if run_dir is None or not run_dir.is_dir():
+    if run_dir is None or not (run_dir / "config.toml").is_file():
         raise ConfigError(f"{run_dir or 'no run'}: no such run; name its directory, as in ccatp alarms history RUN_DIR")
     events = list(read_history(run_dir))
     if json_output:

@@ -13,6 +13,7 @@ from ccatp.errors import ConfigError, RefusedError
 
 LOCK_FILE = "lock"
 RUN_LOCK = ".lock"  # in a run directory; held by the daemon that writes there
+ORIGIN_FILE = "origin.json"  # in a run directory: what a resumed run keeps and its configuration does not have
 # Held by the simulated robot that publishes its truth there.
 TRUTH_LOCK_FILE = "truth.lock"
 # Folders in the usual folder: each of a simulation that began while another daemon ran.

@@ -402,8 +402,8 @@ def is_being_written(path: Path) -> bool:
 def damage_text(path: Path, damage: str) -> str:
     """Why a recording could not be read to its end, for a reader of the run."""
     if is_being_written(path):
-        return f"{path.name}: still being written; what it holds so far is in this report"
-    return f"{damage.replace(str(path), path.name)}; the rest is in this report"
+        return f"{path.name}: still being written; what it holds so far is used"
+    return f"{damage.replace(str(path), path.name)}; the rest is used"
 
 
 RECORD_FORMAT = 3

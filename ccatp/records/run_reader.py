@@ -1,5 +1,6 @@
 """Reads a run directory: recordings with configuration, ordered events and poses; and the survey of a run."""
 
+import json
 import tempfile
 from array import array
 from collections import deque
@@ -12,7 +13,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
-from ccatp.config.files import read_input
+from ccatp.config.files import read_input, read_text
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray, IntArray, Measured, PanelId, PointId, Vector3
@@ -21,6 +22,7 @@ from ccatp.links import topics
 from ccatp.links.bus_codec import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
+from ccatp.links.runtime_dir import ORIGIN_FILE
 from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.records.recorder import (
     RECORD_FORMAT,
@@ -399,10 +401,11 @@ def read_run(run_dir: Path, overrides: Mapping[str, object]) -> RecordedSurvey:
 def read_truth(run_dir: Path, warnings: list[str]) -> tuple[Injected | None, bool | None]:
     """The simulated misalignment of the panels, and whether they were simulated; defects are added to ``warnings``."""
     found: list[Injected] = []
-    is_simulation: bool | None = None
+    is_simulation = began_simulated(run_dir)
     for path in recordings(run_dir / TELEMETRY):
         try:
-            is_simulation = read_metadata(path).get("simulation") == "true"
+            if (mark := read_metadata(path).get("simulation")) is not None:  # it may be damaged
+                is_simulation = mark == "true"
             injected = _injected(path) if is_simulation else None
         except OSError as error:
             warnings.append(f"{path}: cannot be read: {error.strerror or error}; the truth is not compared")
@@ -413,6 +416,15 @@ def read_truth(run_dir: Path, warnings: list[str]) -> tuple[Injected | None, boo
         warnings.append("the sessions of this run simulated differently misaligned panels; the truth is not compared")
         return None, is_simulation
     return (found[0] if found else None), is_simulation
+
+
+def began_simulated(run_dir: Path) -> bool | None:
+    """Whether a run began in simulation; ``None`` where that is not known, as in runs of older versions."""
+    try:
+        mark = json.loads(read_text(run_dir / ORIGIN_FILE))["simulation"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return mark if isinstance(mark, bool) else None
 
 
 def begun_utc_ns(run_dir: Path) -> int | None:

@@ -437,8 +437,8 @@ def coverage_of(found: Findings) -> dict[str, int]:
 _FINISHED = "run finished: status 0"
 _OUTCOMES = {
     End.COMPLETE: COMPLETE,
-    End.AT_BASE: SurveyOutcome.AT_BASE,
-    End.STOPPED: SurveyOutcome.STOPPED,
+    End.AT_BASE: str(SurveyOutcome.AT_BASE),
+    End.STOPPED: str(SurveyOutcome.STOPPED),
     End.FAULTED: "ended with a fault",
     End.INTERRUPTED: "interrupted",
     End.FAILED: "failed",

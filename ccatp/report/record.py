@@ -27,6 +27,7 @@ from ccatp.records.run_reader import (
     STORE,
     RunReadError,
     Trace,
+    began_simulated,
     check_format,
     check_run_dir,
     read_truth,
@@ -205,7 +206,7 @@ class RunFolder:
 
     def __init__(self, run_dir: Path, log_holds: str) -> None:
         self.run_dir = run_dir
-        self.is_simulation: bool | None = None  # as the last recording says
+        self.is_simulation = began_simulated(run_dir)  # or as the last recording says
         self.missing: list[str] = []
         self.warnings: list[str] = []
         self.places: tuple[RecordingPlace, ...] = ()  # of the recordings that were read
@@ -245,7 +246,8 @@ class RunFolder:
         except FileNotFoundError:
             self.missing.append(f"{path.name}: the run is in progress, or was killed before its end")
         except (OSError, ValueError) as error:
-            self.warnings.append(f"{path.name}: cannot be read: {error}")
+            why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
+            self.warnings.append(f"{path.name}: cannot be read: {why}")
         return None
 
     def recordings(

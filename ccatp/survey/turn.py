@@ -208,7 +208,14 @@ def _does(status: MissionStatus, turn: Turn) -> str:
     does = _STANDS.get(Kind(turn.kind), move)
     if turn.why.condition == OPERATOR.name:
         return f"{does}{', called' if turn.kind in MOVING else ''} by {turn.why.values.get('by') or 'an operator'}"
-    return f"{does}: {text_of(turn.why)}" if turn.why else does
+    how = ", after" if is_after_hold(status) else ""
+    return f"{does}{how}: {text_of(turn.why)}" if turn.why else does
+
+
+def is_after_hold(status: MissionStatus) -> bool:
+    """Whether the cause is that of a hold that has ended: the robot takes a fix before it continues its task."""
+    turn = status.turn
+    return turn.kind == Kind.WORK and turn.next == Next.GO_ON and turn.why.condition == status.condition != ""
 
 
 def _hands(cause: Cause) -> str:

@@ -42,11 +42,12 @@ from ccatp.survey.statechart import Mission
 
 
 def state_text(state: Mode, cause: str) -> str:
-    """Text about a hold, or about the state after it."""
-    if cause:
-        return f"{state}: {cause}"
-    is_end = state in (Mode.HELD, Mode.BACKING_OFF, Mode.DONE)
-    return f"{state}" if is_end else f"resumed: {state}"
+    """Text about a hold, or about the state after it; the end of a run says itself why it ended."""
+    if state is Mode.DONE:
+        return f"{state}"
+    if state in (Mode.HELD, Mode.BACKING_OFF, Mode.RETURNING):
+        return f"{state}: {cause}" if cause else f"{state}"
+    return f"resumed: {state}, after: {cause}" if cause else f"resumed: {state}"
 
 
 GIVEN_UP = "no calibration drive, because the robot was held elsewhere: slip and heading are learned on the way"

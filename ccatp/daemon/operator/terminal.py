@@ -21,7 +21,7 @@ from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionS
 from ccatp.missions import kind_of
 from ccatp.records.summary import format_table
 from ccatp.survey.ending import ending_text, read_ending
-from ccatp.survey.turn import is_under_way, turn_text
+from ccatp.survey.turn import is_after_hold, is_under_way, turn_text
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
 STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
@@ -176,7 +176,7 @@ def status_rows(answered: Mapping[str, Any], text: RunText | None = None) -> lis
     accuracy = arrival if text is None else text.accuracy
     filled = round(BAR * share_done(status))
     skips = f", {status.skipped} skipped" if status.skipped else ""
-    row = find_condition(status.condition)
+    row = None if is_after_hold(status) else find_condition(status.condition)
     severity = Severity(max(status.severity, row.severity if row is not None else 0))
     late = f"{status.missed_deadlines}, worst {status.worst_lateness_ms:.0f} ms"
     grip = f"friction {status.friction:.2f}, thrust {status.grip:.2f} times the least that holds the robot"
@@ -189,7 +189,7 @@ def status_rows(answered: Mapping[str, Any], text: RunText | None = None) -> lis
         ("summary state", status.summary_state),
         ("cause", status.cause),
         ("severity", severity.name.lower() if severity else ""),
-        ("for", clock(status.t_s - status.since_s) if status.cause else ""),
+        ("for", clock(status.t_s - status.since_s) if status.cause and not is_after_hold(status) else ""),
         ("alarms", alarms_text(status.alarms)),
         ("what to do", row.advice if row is not None else ""),
         ("outcome", status.outcome),

@@ -20,6 +20,7 @@ from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import (
     BESIDE,
     LOCK_FILE,
+    ORIGIN_FILE,
     RUN_LOCK,
     TRUTH_LOCK_FILE,
     is_held,
@@ -32,8 +33,6 @@ from ccatp.missions import MissionKind, kind_of
 UNFINISHED_FILE = Path("runs") / "unfinished"
 # Emergencies that were active when a run finished, for the next run, because without a daemon nobody can clear them.
 LATCHED_FILE = Path("runs") / EMERGENCIES_FILE
-# In the run directory: properties that a resumed run keeps, and that are not in its configuration.
-ORIGIN_FILE = "origin.json"
 # Complete, or at base after an abort: such a run is not resumed.
 FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
 

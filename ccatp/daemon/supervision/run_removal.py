@@ -6,9 +6,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from ccatp.config.load import kind_in
-from ccatp.daemon.supervision.run_dir import CHILDREN_LOCK, ORIGIN_FILE, finished_summary
+from ccatp.daemon.supervision.run_dir import CHILDREN_LOCK, finished_summary
 from ccatp.errors import ConfigError, RefusedError
-from ccatp.links.runtime_dir import RUN_LOCK, is_held, locked
+from ccatp.links.runtime_dir import ORIGIN_FILE, RUN_LOCK, is_held, locked
 from ccatp.records.recorder import TELEMETRY
 from ccatp.records.run_reader import CONFIG, STORE
 

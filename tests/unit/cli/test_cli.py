@@ -184,10 +184,12 @@ def test_alarms_are_shown_acknowledged_and_kept(
     line = (
         '{"utc":"A","t_s":1.0,"event":"acknowledged","name":"fan_weak","severity":"return","cause":"weak","by":"anna"}'
     )
+    (tmp_path / "config.toml").touch()
     (tmp_path / "alarms.jsonl").write_text(f"{line}\n{line[:40]}")
     assert printed(capsys, "alarms", "history", tmp_path) == "A  acknowledged by anna: return fan_weak: weak\n"
     assert answered(capsys, "alarms", "history", tmp_path) == {"history": [json.loads(line)]}
-    assert "no such run; name its directory" in refused(capsys, "alarms", "history", tmp_path / "none")
+    for folder in (tmp_path / "none", runtime_dir):
+        assert "no such run; name its directory" in refused(capsys, "alarms", "history", folder)
 
 
 def test_an_emergency_is_one_entry_of_the_alarms_with_the_command_that_ends_it(

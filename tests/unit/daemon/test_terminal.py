@@ -114,6 +114,8 @@ def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.Captur
         (Mode.TURNING, "", "resumed: turning"),
         (Mode.RETURNING, "fire", "returning: fire"),
         (Mode.HELD, "", "held"),
+        (Mode.SETTLING, "frame late", "resumed: settling, after: frame late"),  # it takes a fix first
+        (Mode.DONE, "frame late", "done"),  # an operator stopped it
     ],
 )
 def test_a_mission_that_continues_reports_it(state: Mode, cause: str, text: str) -> None:

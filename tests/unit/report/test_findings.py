@@ -13,6 +13,7 @@ import pytest
 from ccatp.core import PointId
 from ccatp.links.topics import BY_NAME, MissionStatus
 from ccatp.records.recorder import Recorder, iter_messages
+from ccatp.records.run_reader import read_truth
 from ccatp.records.state_log import StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint
 from ccatp.report.findings import Grade, TimeBreakdown, findings_of, outcome_of, point_verdicts, spells_of, time_budget
@@ -155,7 +156,7 @@ def test_a_run_that_was_killed(without: Callable[..., Path]) -> None:
     assert found.missing == ("summary.json: the run is in progress, or was killed before its end",)
     torn, line = sorted(found.warnings, reverse=True)
     assert torn.startswith("telemetry.mcap: damaged or cut off at byte ")
-    assert torn.endswith("; the rest is in this report")
+    assert torn.endswith("; the rest is used")
     assert line == "log.jsonl: 1 lines cannot be read and are not used"
     assert len(only(found).track.seq) > 500
     ended = findings_of(found).outcome
@@ -183,10 +184,22 @@ def test_what_is_missing_is_reported(without: Callable[..., Path]) -> None:
     assert (found.is_simulation, found.points, found.sessions) == (None, None, ())
 
 
+def test_a_simulated_run_with_a_spoilt_recording_is_none_of_a_real_robot(run_dir: Path) -> None:
+    (run_dir / "origin.json").write_text('{"simulation": true, "run_id": "1"}')
+    for recording in run_dir.glob("telemetry*.mcap"):
+        recording.unlink()
+    (run_dir / "telemetry.mcap").write_bytes(b"spoilt")
+    assert read_record(run_dir).is_simulation is True
+    assert read_truth(run_dir, []) == (None, True)
+    (run_dir / "origin.json").write_text("{")
+    assert read_record(run_dir).is_simulation is None
+    assert read_truth(run_dir, []) == (None, None)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "warning"),
     [
-        ("summary.json", b"{", "summary.json: cannot be read: Expecting property name"),
+        ("summary.json", b"{", "summary.json: cannot be read: damaged"),
         ("summary.json", b"[1, 2]", "summary.json: is no summary"),
         ("summary.json", b"null", "summary.json: is no summary"),
         ("mission.sqlite", bytes(5000), "mission.sqlite: damaged or not a mission store: file is not a database"),

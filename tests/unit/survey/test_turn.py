@@ -11,6 +11,7 @@ from ccatp.conditions import Actor, Clear, Condition, Motion, all_conditions
 from ccatp.conditions.danger import EARTHQUAKE, EMERGENCY, ENCODERS_STALE, LIFTED, WHEEL_BLOCKED
 from ccatp.conditions.mission import LASER_NOT_READY, NO_FRAME_FOR, OPERATOR
 from ccatp.core import NO_CAUSE, Cause, Severity, Verdict
+from ccatp.daemon.operator.terminal import status_rows
 from ccatp.errors import ExitStatus
 from ccatp.links.topics import MissionStatus, Turn
 from ccatp.survey.engagement import (
@@ -135,6 +136,18 @@ def test_a_daemon_that_has_ended_accepts_nothing_even_if_its_mission_was_held() 
     assert text.does == "ended with a fault; b"
     assert (text.who, text.request) == ("an operator:", "")
     assert text.then.startswith("look for an obstacle at the wheel; 'ccatp run --resume'")
+
+
+def test_what_held_the_robot_is_not_why_it_measures_afterwards() -> None:
+    """Until the fix the state keeps the cause; an operator who has resumed is not asked to resume."""
+    s = State(Task(stands=True), cause=ENCODERS_STALE.cause())
+    status = status_of(s, turn_of(s, None, ()), condition=s.cause.condition, cause="encoder samples stale")
+    assert turn_text(status).line == (
+        "measuring the next stop, after: encoder samples stale. Next: the robot continues by itself"
+    )
+    rows = dict(status_rows(msgspec.to_builtins(status)))
+    assert rows["cause"] == "encoder samples stale"
+    assert (rows.get("what to do", ""), rows.get("severity", ""), rows.get("for", "")) == ("", "", "")
 
 
 def test_a_robot_that_waits_for_its_laser_says_so_and_continues_by_itself() -> None:
