@@ -50,7 +50,10 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 )
 @click.option("--start", metavar="X,Y,HEADING", help="First pose, in place of that of the truth: m, m, rad.")
 @click.option(
-    "--tag", default="", metavar="NAME", help="Radio of the vehicle that is used; by default that of most readings."
+    "--tag",
+    default="",
+    metavar="NAME",
+    help="Only radio of the vehicle that is used; by default all whose place is given.",
 )
 @click.option("--topics", "topics_file", type=common.PATH, help="TOML file that names the topics of a ROS bag.")
 @common.figure_option("Draw map, path and residuals")
@@ -104,6 +107,8 @@ def slam(
         from ccatp.beacons.report.slam_files import write_slam
 
         write_slam(out_dir, run, track, getattr(assumed, run.kind))
+        if run.tags:
+            common.warn(["graph.pyfg is not written: the format has no places of several tags on the vehicle"])
     if figure_file is not None:
         from ccatp.beacons.report.plots import draw_slam
 

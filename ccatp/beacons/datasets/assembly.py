@@ -10,6 +10,7 @@ from ccatp.beacons.datasets.events import EVENTS, MOTIONS, READING_KINDS, Record
 from ccatp.beacons.datasets.ordering import in_seconds, ordered
 from ccatp.beacons.datasets.placeholders import frozen, measured, true_positions, without_wild_steps
 from ccatp.beacons.datasets.tables import RadioDataError, Table, instant, listed, long_pauses, needed_of, plural, within
+from ccatp.beacons.datasets.tags import radios_of
 from ccatp.beacons.datasets.trajectory import (
     BEFORE_S,
     at_antenna,
@@ -19,7 +20,7 @@ from ccatp.beacons.datasets.trajectory import (
     pose_of_truth,
     way_at,
 )
-from ccatp.beacons.estimation.recording import Known, KnownMap, Readings, RecordedRun, ReferencePath, Steps
+from ccatp.beacons.estimation.recording import Known, KnownMap, Radio, Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray
 
 NOTHING = Known()
@@ -33,22 +34,26 @@ LATE_TRUTH_S, LATE_SHARE = 1.0, 0.5  # the run begins with the truth if that beg
 STILL_M, STILL_RAD = 0.1, 0.05  # unless the vehicle stands until then
 
 
-def checked_run(recording: Recording, *, turns_heading: bool = True, known: Known = NOTHING) -> RecordedRun:
+def checked_run(
+    recording: Recording, *, turns_heading: bool = True, known: Known = NOTHING, tag: str = ""
+) -> RecordedRun:
     """The run of a recording, ordered, without what cannot be, with a warning of each kind that was left out.
 
     ``turns_heading``: whether a heading of the truth that is turned against its course is corrected, or only reported.
-    ``known``: what the estimators may use. Raises RadioDataError: there is no odometry or no reading
-    of a beacon, or none of a beacon on the map.
+    ``known``: what the estimators may use. ``tag``: the only radio of the vehicle whose readings are used; by default
+    all whose place is known. Raises RadioDataError: there is no odometry or no reading of a beacon, or none of a beacon
+    on the map.
     """
     with np.errstate(all="ignore"):  # numbers that overflow are left out below
-        return _checked(recording, turns_heading, known)
+        return _checked(recording, turns_heading, known, tag)
 
 
-def _checked(recording: Recording, turns_heading: bool, known: Known) -> RecordedRun:
+def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) -> RecordedRun:
     file, names, warnings = recording.file, recording.names, list(recording.warnings)
-    tables = dict(recording.tables)
-    surveyed, mounted = tables.pop("beacon", None), tables.pop("antenna", None)
     _check_complete(recording)
+    radios = radios_of(recording, tag, warnings)
+    tables = dict(recording.tables) | radios.tables
+    surveyed, *_ = (tables.pop(kind, None) for kind in ("beacon", "antenna", "tag"))
     tables = {kind: in_seconds(_usable(kind, table, warnings), warnings) for kind, table in tables.items()}
     tables = ordered({kind: table for kind, table in tables.items() if len(table.values)}, warnings)
     truth_rows = true_positions(tables["truth"], "truth", warnings) if "truth" in tables else None
@@ -70,18 +75,29 @@ def _checked(recording: Recording, turns_heading: bool, known: Known) -> Recorde
     if known.map is not None:
         heights_m |= _heights(known.map)
         known_map = _of_beacons(known.map, beacon_ids, recording, warnings)
-    ahead_m, left_m, up_m = _antenna(mounted)
-    above_m = np.array([heights_m.get(beacon, np.nan) - up_m for beacon in beacon_ids])
-    readings = _in_the_plane(readings, np.nan_to_num(above_m), warnings)
+    places = list(radios.tags_m.values()) or [radios.antenna_m]
+    z_m = np.array([heights_m.get(beacon, np.nan) for beacon in beacon_ids])
+    above_m = np.array([np.nan_to_num(z_m - up_m) for *_, up_m in places])
+    readings = _in_the_plane(readings, above_m, warnings)
     if not len(readings.times_s):
         raise RadioDataError(file, f"none of its readings can be used ({'; '.join(warnings[-3:])})")
+    ahead_m, left_m, _ = radios.antenna_m
+    tags = tuple(Radio(name, *place[:2]) for name, place in radios.tags_m.items())
+    if tags:
+        readings = readings._replace(arm_m=np.array([tag[1:] for tag in tags])[readings.tag])
+        if truth is not None and not np.isfinite(truth.heading_rad).all():
+            warnings.append(
+                "the truth has no headings: its positions are taken as those of the vehicle's origin, not of a tag"
+            )
+    else:
+        readings = readings._replace(tag=None)
     if ahead_m or left_m:
         steps, truth, first_pose = at_antenna(
             steps, truth, first_pose, (ahead_m, left_m), warnings, is_given=known.first_pose is not None
         )
     run = RecordedRun(
         recording.name, recording.kind, steps, readings, beacon_ids, places_m, truth, first_pose, (),
-        (ahead_m, left_m), known_map,
+        (ahead_m, left_m), known_map, tags,
     )  # fmt: skip
     # A row with two readings gives the same warning of each.
     return replace(run, warnings=tuple(dict.fromkeys((*warnings, *suspicions(run)))))
@@ -187,8 +203,8 @@ def _readings(
     recording: Recording, tables: dict[str, Table], steps: Steps, warnings: list[str]
 ) -> tuple[Readings, tuple[str, ...]]:
     """Readings with range, bearing and strength of one beacon at one time in one row, and the names of the beacons."""
-    merged: dict[tuple[float, float], list[float]] = {}
-    extra: list[tuple[float, float, list[float]]] = []
+    merged: dict[tuple[float, float, float], list[float]] = {}
+    extra: list[tuple[float, float, float, list[float]]] = []
     spans = []
     for place, kind in enumerate(READING_KINDS):
         if kind not in tables:
@@ -197,19 +213,21 @@ def _readings(
         spans += table.values[:, 0].tolist()
         table = table.where(within(table.values[:, 0], steps.times_s, kind, warnings))
         table = frozen(kind, table, way_at(steps, table.values[:, 0]), recording.names, warnings)
-        for t, who, value in table.values.tolist():
-            row = merged.setdefault((t, who), [np.nan] * len(READING_KINDS))
+        for t, who, value, by in table.values.tolist():
+            row = merged.setdefault((t, who, by), [np.nan] * len(READING_KINDS))
             if np.isnan(row[place]):
                 row[place] = value
             else:  # a second value of this kind at the same time
-                extra.append((t, who, [value if k == place else np.nan for k in range(len(READING_KINDS))]))
+                extra.append((t, who, by, [value if k == place else np.nan for k in range(len(READING_KINDS))]))
     if not merged:
         raise RadioDataError(recording.file, _no_readings(spans, steps, warnings))
-    rows = sorted([(t, who, row) for (t, who), row in merged.items()] + extra, key=lambda item: item[0])
-    _check_names(recording, [int(who) for _, who, _ in rows])
-    beacons, index = np.unique([int(who) for _, who, _ in rows], return_inverse=True)
-    data = np.array([row for _, _, row in rows]).reshape(-1, len(READING_KINDS))
-    readings = Readings(np.array([t for t, _, _ in rows]), index.astype(np.int64), *data.T.copy())
+    rows = sorted([(*key, row) for key, row in merged.items()] + extra, key=lambda item: item[0])
+    _check_names(recording, [int(who) for _, who, *_ in rows])
+    beacons, index = np.unique([int(who) for _, who, *_ in rows], return_inverse=True)
+    data = np.array([row for *_, row in rows]).reshape(-1, len(READING_KINDS))
+    times_s, tag = np.array([(t, by) for t, _, by, _ in rows]).T.copy()
+    range_m, bearing_rad, rssi_dbm = data.T.copy()
+    readings = Readings(times_s, index.astype(np.int64), range_m, bearing_rad, rssi_dbm, tag.astype(np.int64))
     return readings, tuple(recording.names[int(who)] for who in beacons)
 
 
@@ -292,24 +310,16 @@ def _of_beacons(
     return here
 
 
-def _antenna(mounted: Table | None) -> tuple[float, float, float]:
-    if mounted is None:
-        return 0.0, 0.0, 0.0
-    if len(mounted.values) > 1 or not np.isfinite(mounted.values[0, :2]).all():
-        raise RadioDataError(mounted.file, "more than one antenna, or one at no place", int(mounted.lines[-1]))
-    ahead_m, left_m, up_m = np.nan_to_num(mounted.values[0]).tolist()
-    return ahead_m, left_m, up_m
-
-
 def _in_the_plane(readings: Readings, above_m: FloatArray, warnings: list[str]) -> Readings:
-    """Ranges projected to the plane. ``above_m``: height of each beacon above the antenna, shape (b,)."""
-    squares = readings.range_m**2 - above_m[readings.beacon] ** 2
+    """Ranges projected to the plane. ``above_m``: height of each beacon above each radio, shape (t, b)."""
+    height_m = above_m[readings.tag, readings.beacon]
+    squares = readings.range_m**2 - height_m**2
     if (short := (squares < 0.0) & (readings.range_m > 0.0)).any():
         warnings.append(
             f"{plural(int(short.sum()), 'range')} shorter than the beacon is above the antenna, not used, the first at "
             f"{instant(readings.times_s[int(np.argmax(short))])}"
         )
         readings = readings.where(~short)
-        squares = squares[~short]
-    level_m = np.where(above_m[readings.beacon] == 0.0, readings.range_m, np.sqrt(np.maximum(squares, 0.0)))
+        squares, height_m = squares[~short], height_m[~short]
+    level_m = np.where(height_m == 0.0, readings.range_m, np.sqrt(np.maximum(squares, 0.0)))
     return readings._replace(range_m=level_m)

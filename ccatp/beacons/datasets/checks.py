@@ -6,8 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.beacons.datasets.consistency import inconsistencies
+from ccatp.beacons.datasets.mounting import misplaced_radios
 from ccatp.beacons.datasets.tables import GAP_S, instant, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor, way_at
+from ccatp.beacons.estimation.evaluation import truth_at
 from ccatp.beacons.estimation.recording import Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray
 
@@ -36,9 +38,11 @@ def readings_against(run: RecordedRun, truth: ReferencePath) -> Iterator[str]:
     if inside.sum() < FEW:
         return
     pose = np.column_stack([np.interp(t[inside], truth.times_s, column) for column in truth[1:]])
+    seen = r.where(inside)
     if not np.isfinite(truth.heading_rad).all():
         pose[:, 2] = np.nan
-    seen = r.where(inside)
+        seen = seen._replace(arm_m=None)  # without a heading the radios are about where the vehicle is
+    pose[:, :2] = seen.radios_at(pose)
     lines, off_rad = _bearings(seen, pose, placed)
     strange = yield from _misplaced(run.beacon_ids, placed, seen, pose, off_rad)
     yield from _ranges(seen, pose, placed, strange)
@@ -200,6 +204,8 @@ def _against_truth(run: RecordedRun) -> Iterator[str]:
     yield from against
     if not any(line.startswith("the truth never moves") for line in against):
         yield from readings_against(run, run.truth)
+        poses = truth_at(run.truth, run.readings.times_s)
+        yield from misplaced_radios(run, poses, run.beacon_truth_m, "truth and survey")
 
 
 def _gaps(run: RecordedRun) -> Iterator[str]:

@@ -27,7 +27,6 @@ from ccatp.beacons.datasets.tables import (
     split_cells,
     tables_of,
 )
-from ccatp.beacons.datasets.tags import chosen_tag
 from ccatp.core import FloatArray
 
 LEAST_COLUMNS = 3  # of a table of readings
@@ -101,11 +100,11 @@ def is_columns(text: str) -> bool:
     )
 
 
-def read_columns(path: Path, tag: str = "") -> Recording:
+def read_columns(path: Path) -> Recording:
     """Read a table of readings, and beside it those of odometry and, if there are, of truth, beacons and tags.
 
-    ``path``: the table of readings, or a folder with one. ``tag``: the vehicle's radio whose readings are used. Raises
-    RadioDataError: one of the first two is missing, or there are several of one of the others.
+    ``path``: the table of readings, or a folder with one. Raises RadioDataError: one of the first two is missing, or
+    there are several of one of the others.
     """
     folder = path if path.is_dir() else path.parent
     texts = _texts(folder)
@@ -133,11 +132,11 @@ def read_columns(path: Path, tag: str = "") -> Recording:
             raise RadioDataError(
                 folder, f"has {len(found)} tables of {what} beside {file.name}: {names}; leave one in the folder"
             )
-    warnings: list[str] = []
     numbers: dict[str, float] = {}
-    table, tag = _of_one_tag(_read(file, text), tag, warnings)
-    has_tags = bool(warnings)
-    events = tables_of(file, _readings(table, numbers))
+    tags: dict[str, float] = {}
+    table = _read(file, text)
+    warnings = _exchanged(table)
+    events = tables_of(file, _readings(table, numbers, tags))
     events |= dict([_motion(odometry[0])])
     if truths:
         events["truth"] = truths[0].poses()
@@ -146,10 +145,8 @@ def read_columns(path: Path, tag: str = "") -> Recording:
     for survey in surveys.values():
         events["beacon"] = _survey(survey, numbers)
     for mount in mounts.values():
-        events |= _antenna(mount, tag)
-    if has_tags and "antenna" not in events:  # there are several tags, so not all are in the middle
-        warnings.append(f"the place of tag {tag} is not known (no table of tag, forward, left): it is taken as zero")
-    return Recording(file, name_of(file), "csv", events, tuple(numbers), tuple(warnings))
+        events["tag"] = _mounted(mount, tags)
+    return Recording(file, name_of(file), "csv", events, tuple(numbers), tuple(warnings), tuple(tags))
 
 
 def read_survey(file: Path, text: str) -> tuple[list[str], FloatArray, FloatArray]:
@@ -243,23 +240,20 @@ def _is_motion(quantities: set[str]) -> bool:
     return any(wanted <= quantities for wanted in ({"x", "y"}, {"speed", "rate"}, {"turn"}))
 
 
-def _of_one_tag(table: ColumnFile, wanted: str, warnings: list[str]) -> tuple[ColumnFile, str]:
-    """The readings of one of the vehicle's radios, and its name; "" if the table names none."""
+def _exchanged(table: ColumnFile) -> list[str]:
+    """A warning if there are several tags and one beacon."""
     at, named = table.places.get("tag"), table.places.get("beacon")
-    if at is None:
-        if wanted:
-            raise RadioDataError(table.file, f"has no column of tags, so none of tag {wanted}", 1)
-        return table, ""
-    names = [beacon_name(cells[at]) for _, cells in table.rows]
-    tag = chosen_tag(table.file, Counter(names), wanted, warnings)
-    if len({*names}) > 1 and named is not None and len({cells[named] for _, cells in table.rows}) == 1:
-        warnings.append(f"{table.file.name}: several tags and one beacon: are these two columns exchanged?")
-    rows = [row for row, name in zip(table.rows, names, strict=True) if name == tag]
-    return table._replace(rows=rows), tag
+    if at is None or named is None or len({cells[at] for _, cells in table.rows}) == 1:
+        return []
+    if len({cells[named] for _, cells in table.rows}) > 1:
+        return []
+    return [f"{table.file.name}: several tags and one beacon: are these two columns exchanged?"]
 
 
-def _readings(table: ColumnFile, numbers: dict[str, float]) -> Iterator[tuple[str, int, list[float]]]:
-    named = table.places.get("beacon")
+def _readings(
+    table: ColumnFile, numbers: dict[str, float], tags: dict[str, float]
+) -> Iterator[tuple[str, int, list[float]]]:
+    named, tagged = table.places.get("beacon"), table.places.get("tag")
     readings = [(k, column) for k, column in enumerate(table.columns) if column and column.quantity in READING_KINDS]
     if named is not None:  # beside a column of names, others than "range" itself are no beacons
         readings = [(k, column) for k, column in readings if not column.beacon]
@@ -277,7 +271,9 @@ def _readings(table: ColumnFile, numbers: dict[str, float]) -> Iterator[tuple[st
             if not name:
                 raise RadioDataError(table.file, "the reading has no name of a beacon", line)
             beacon = numbers.setdefault(name, float(len(numbers)))
-            yield column.quantity, line, [time_s, beacon, table.value(line, cells, k)]
+            tag = "" if tagged is None else beacon_name(cells[tagged])
+            by = tags.setdefault(tag, float(len(tags))) if tag else np.nan
+            yield column.quantity, line, [time_s, beacon, table.value(line, cells, k), by]
 
 
 def _places_beside(table: ColumnFile, numbers: dict[str, float], warnings: list[str]) -> Table | None:
@@ -323,8 +319,12 @@ def _survey(table: ColumnFile, numbers: dict[str, float]) -> Table:
     return places._replace(values=np.column_stack([names, places.values])[:, : len(EVENTS["beacon"])])
 
 
-def _antenna(table: ColumnFile, tag: str) -> dict[str, Table]:
-    """The place of one of the vehicle's radios, if the table of their places has it."""
-    at = table.places.get("tag")
-    rows = [(line, cells) for line, cells in table.rows if at is not None and beacon_name(cells[at]) == tag]
-    return {"antenna": table._replace(rows=rows).values("forward_m", "left_m", "up_m")} if rows else {}
+def _mounted(table: ColumnFile, tags: dict[str, float]) -> Table:
+    """Places of the vehicle's radios. Raises RadioDataError: one has no name."""
+    at, names = table.places.get("tag") or 0, []
+    for line, cells in table.rows:
+        if not cells[at]:
+            raise RadioDataError(table.file, "the place has no name of a tag", line)
+        names.append(tags.setdefault(beacon_name(cells[at]), float(len(tags))))
+    places = table.values("forward_m", "left_m", "up_m")
+    return places._replace(values=np.column_stack([names, places.values]))

@@ -11,6 +11,7 @@ from ccatp.beacons.datasets.tables import instant
 from ccatp.beacons.datasets.trajectory import CONSTANT_RAD, STRAIGHT
 from ccatp.beacons.estimation.recording import (
     BoolArray,
+    Radio,
     Readings,
     RecordedRun,
     ReferencePath,
@@ -44,7 +45,7 @@ MAJORITY = 0.65  # of the windows fit better
 LEAST_HEIGHT_M = 1.0
 FIRST_ARM_M, FINE_ARM_M, MOST_TRIES = 0.3, 0.01, 80  # of the search for the place of a radio on the vehicle
 LEAST_ARM_M, MOST_ARM_M = 0.15, 10.0  # above the error of the ranges, and as long as vehicles are
-CLEARLY = 0.9  # of the misfit that remains with another clock
+CLEARLY = 0.9  # of the misfit that remains with another clock, or with another sign
 FARTHEST = 5.0  # windows beyond this many usual misfits count as that
 DEGREES = np.pi / 180.0
 LEAST_TURN_RAD = 3.0
@@ -119,7 +120,7 @@ def _lengths(run: RecordedRun, path: FloatArray) -> Iterator[str]:
     shares, largest = [], []
     for beacon in range(len(run.beacon_ids)):
         seen = run.readings.where((run.readings.beacon == beacon) & np.isfinite(run.readings.range_m))
-        ratios = _changes(seen, _places(run.steps.times_s, path, seen.times_s), APART * extent_m)
+        ratios = _changes(seen, seen.radios_at(_poses(run.steps.times_s, path, seen.times_s)), APART * extent_m)
         if ratios.size >= FEWEST_PAIRS:
             shares.append(float(np.percentile(ratios, 75.0)))
             largest.append(float(np.percentile(ratios, 90.0)))
@@ -150,8 +151,8 @@ def _changes(seen: Readings, at: FloatArray, apart_m: float) -> FloatArray:
     return np.array(found)
 
 
-def _places(times_s: FloatArray, path: FloatArray, at_s: FloatArray) -> FloatArray:
-    return np.column_stack([np.interp(at_s, times_s, path[:, k]) for k in range(2)])
+def _poses(times_s: FloatArray, path: FloatArray, at_s: FloatArray) -> FloatArray:
+    return np.column_stack([np.interp(at_s, times_s, column) for column in path.T])
 
 
 def _against_survey(run: RecordedRun, path: FloatArray) -> Iterator[str]:
@@ -185,7 +186,6 @@ class _Windows:
         self.is_pointed = bool(pointed.sum() > 0.5 * pointed.size)
         if self.is_pointed:
             seen = seen.where(pointed)
-        self.times_s, self.range_m, self.bearing_rad = seen.times_s, seen.range_m, seen.bearing_rad
         self.group: IntArray = np.full(len(seen.times_s), -1, dtype=np.int64)
         intervals = [np.diff(seen.times_s[seen.beacon == k]) for k in range(len(run.beacon_ids))]
         usual = [float(np.median(one)) for one in intervals if one.size]
@@ -200,18 +200,26 @@ class _Windows:
         renumbered = np.cumsum(kept) - 1
         self.group = np.where(kept[group], renumbered[group], -1)
         self.count = int(kept.sum())
-        rows = self.group >= 0
-        self.times_s, self.range_m, self.group = self.times_s[rows], self.range_m[rows], self.group[rows]
-        self.bearing_rad = self.bearing_rad[rows]
+        self._seen, self.group = seen.where(self.group >= 0), self.group[self.group >= 0]
+        self.times_s, self.range_m, self.bearing_rad = self._seen.times_s, self._seen.range_m, self._seen.bearing_rad
         self.begin_s = np.full(self.count, np.inf)
         np.minimum.at(self.begin_s, self.group, self.times_s)
 
-    def misfits(self, times_s: FloatArray, path: FloatArray, lag_s: float = 0.0) -> FloatArray:
-        """Root mean square of the misfit of each window, m, if the path is taken ``lag_s`` later; shape (count,)."""
-        at = _places(times_s, path, self.times_s + lag_s)
+    def misfits(
+        self, times_s: FloatArray, path: FloatArray, lag_s: float = 0.0, signs: tuple[float, float] = (1.0, 1.0)
+    ) -> FloatArray:
+        """Root mean square of the misfit of each window, m, if the path is taken ``lag_s`` later; shape (count,).
+
+        ``signs``: of the places of several radios, ahead and left.
+        """
+        poses = _poses(times_s, path, self.times_s + lag_s)
+        seen = self._seen
+        if seen.arm_m is not None:
+            seen = seen._replace(arm_m=seen.arm_m * np.array(signs))
+        at = seen.radios_at(poses)
         counts = np.bincount(self.group, minlength=self.count)
         if self.is_pointed:
-            way = np.interp(self.times_s + lag_s, times_s, path[:, 2]) + self.bearing_rad
+            way = poses[:, 2] + self.bearing_rad
             at = at + self.range_m[:, None] * np.column_stack([np.cos(way), np.sin(way)])
         at = self._centred(at)
         if self.is_pointed:
@@ -224,7 +232,7 @@ class _Windows:
 
         With a height h the free term is |b|^2 + h^2.
         """
-        fitted = self._fitted(self._centred(_places(times_s, path, self.times_s)))
+        fitted = self._fitted(self._centred(self._seen.radios_at(_poses(times_s, path, self.times_s))))
         counts = np.bincount(self.group, minlength=self.count)
         slope = np.column_stack([-0.5 * fitted.terms[:, :2], np.ones(self.count)])
         spread = np.linalg.solve(fitted.normal, slope[:, :, None])[:, :, 0]
@@ -265,7 +273,7 @@ def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
     if windows.count < LEAST_GROUPS:
         return
     times_s = run.steps.times_s
-    if off := _radio_off_the_origin(windows, times_s, path):
+    if off := _mirrored_tags(windows, times_s, path, run.tags) or _radio_off_the_origin(windows, times_s, path):
         yield off
         return
     if not windows.is_pointed:
@@ -300,6 +308,22 @@ def _above(squares_m2: FloatArray, sigmas_m2: FloatArray) -> Iterator[str]:
             f"ranges are as those of beacons about {np.sqrt(usual_m2):.1g} m above or below the radio, or too long: "
             "give the heights of the beacons (z) and of the antenna, or a prior of the offset"
         )
+
+
+def _mirrored_tags(windows: _Windows, times_s: FloatArray, path: FloatArray, tags: tuple[Radio, ...]) -> str:
+    """A warning if ranges of several radios fit far better with the sign of their places changed."""
+    if not tags:
+        return ""
+    now = windows.misfits(times_s, path)
+    for signs, what in (((1.0, -1.0), "left and right"), ((-1.0, 1.0), "ahead and behind"), ((-1.0, -1.0), "both")):
+        other = windows.misfits(times_s, path, signs=signs)
+        # One of few alternatives, so a smaller advantage counts than for a place that is searched.
+        if _typical(other, now) < CLEARLY * _typical(now, now) and np.mean(other < now) > MAJORITY:
+            return (
+                f"ranges fit the odometry far better if {what} are exchanged in the places of the tags: forward and "
+                "left are positive"
+            )
+    return ""
 
 
 def _radio_off_the_origin(windows: _Windows, times_s: FloatArray, path: FloatArray) -> str:

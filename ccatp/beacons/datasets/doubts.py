@@ -98,8 +98,8 @@ def stray_beacons(run: RecordedRun, track: EstimatedPath) -> list[str]:
     for k, name in enumerate(run.beacon_ids):
         seen = run.readings.where((run.readings.beacon == k) & np.isfinite(run.readings.range_m))
         if name in track.beacons and len(seen.times_s) >= FEWEST:
-            x, y = (np.interp(seen.times_s, track.times_s, track.poses[:, axis]) for axis in (0, 1))
-            off_m = seen.range_m - np.hypot(track.beacons[name].x_m - x, track.beacons[name].y_m - y)
+            at = seen.radios_at(track.poses_at(seen.times_s))
+            off_m = seen.range_m - np.hypot(*(np.array(track.beacons[name][:2]) - at).T)
             misses_m[name] = float(np.median(np.abs(off_m - np.median(off_m))))
     if len(misses_m) < LEAST_BEACONS:
         return []

@@ -23,12 +23,13 @@ EVENTS = {
     "odom": ("time_s", "distance_m", "turn_rad", "(lateral_m)"),
     "speed": ("time_s", "speed_m_s", "turn_rad_s", "(lateral_m_s)"),
     "pose": ("time_s", "x_m", "y_m", "heading_rad"),
-    "range": ("time_s", "beacon", "range_m"),
-    "bearing": ("time_s", "beacon", "bearing_rad"),
-    "rssi": ("time_s", "beacon", "rssi_dbm"),
+    "range": ("time_s", "beacon", "range_m", "(tag)"),
+    "bearing": ("time_s", "beacon", "bearing_rad", "(tag)"),
+    "rssi": ("time_s", "beacon", "rssi_dbm", "(tag)"),
     "truth": ("time_s", "x_m", "y_m", "(heading_rad)"),
     "beacon": ("beacon", "x_m", "y_m", "(z_m)"),
     "antenna": ("forward_m", "left_m", "(up_m)"),
+    "tag": ("tag", "forward_m", "left_m", "(up_m)"),
 }
 MOTIONS = ("odom", "speed", "pose")  # of several, the first there is used
 READING_KINDS = ("range", "bearing", "rssi")
@@ -41,9 +42,12 @@ class Recording(NamedTuple):
     file: Path  # that messages name
     name: str
     kind: str  # the section of the configuration: plaza, mrclam, labyrinth or csv
-    tables: Mapping[str, Table]  # by kind of event, with the columns of ``EVENTS``; a beacon is an index of ``names``
+    # By kind of event, with the columns of ``EVENTS``; a beacon is an index of ``names``, a tag of ``tags``. Readings
+    # may lack the column of the tag.
+    tables: Mapping[str, Table]
     names: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+    tags: tuple[str, ...] = ()  # radios of the vehicle that readings and places name
 
 
 def name_of(file: Path) -> str:
@@ -90,9 +94,10 @@ def read_events_csv(file: Path) -> Recording:
     if file.is_dir():
         raise RadioDataError(file, "is a folder: name the CSV file in it")
     numbers: dict[str, float] = {}
+    tags: dict[str, float] = {}
     rows: list[tuple[str, int, list[float]]] = []
     for line, cells in _rows(read_text(file)):
         is_head = not rows and cells[0] not in EVENTS and not any(is_number(cell) for cell in cells[1:])
         if cells[0] != HEADER and not is_head:
-            rows.append(tagged_row(file, line, cells, EVENTS, numbers))
-    return Recording(file, name_of(file), "csv", tables_of(file, rows), tuple(numbers))
+            rows.append(tagged_row(file, line, cells, EVENTS, numbers, tags))
+    return Recording(file, name_of(file), "csv", tables_of(file, rows), tuple(numbers), tags=tuple(tags))

@@ -35,7 +35,10 @@ SPIKE = 5.0  # times the distance of the neighbours
 
 
 def measured(kind: str, table: Table, warnings: list[str]) -> Table:
-    """The readings of one kind, shape (n, 3): time, beacon, value; without values that were not measured."""
+    """The readings of one kind without values that were not measured.
+
+    ``table``: time, beacon, value, and further columns.
+    """
     values = table.values[:, 2]
     most, unit = LIMITS[kind]
     beyond = ~(np.abs(values) <= most)
@@ -93,8 +96,9 @@ def frozen(kind: str, table: Table, way_m: FloatArray, names: tuple[str, ...], w
     ``way_m``: travelled until each reading, shape (n,).
     """
     stale = np.zeros(len(table.values), dtype=bool)
-    for beacon in np.unique(table.values[:, 1]).tolist():
-        rows = np.flatnonzero(table.values[:, 1] == beacon)
+    pairs, pair = np.unique(table.values[:, [1, *range(3, table.values.shape[1])]], axis=0, return_inverse=True)
+    for k, (beacon, *_) in enumerate(pairs.tolist()):  # of beacon and radio
+        rows = np.flatnonzero(pair.ravel() == k)
         edges = np.flatnonzero(np.diff(table.values[rows, 2]) != 0.0) + 1
         for first, stop in zip([0, *edges.tolist()], [*edges.tolist(), rows.size], strict=True):
             run = rows[first:stop]

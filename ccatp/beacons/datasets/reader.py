@@ -27,9 +27,9 @@ READERS = {
     "plaza": read_plaza,
     "labyrinth": read_labyrinth,
     "csv": read_events_csv,
+    "columns": read_columns,
     "pyfg": read_pyfg,
 }
-TAGGED = ("columns", "bag")
 FORMATS = ("plaza", "mrclam", "labyrinth", "csv", "columns", "pyfg", "bag")
 
 
@@ -40,22 +40,21 @@ def read_run(
     """Read and check a recorded run.
 
     ``data_format``: one of ``FORMATS``; detected from the files if ``None``. ``topics_file``: only for a bag.
-    ``tag``: the vehicle's radio whose readings are used, if it has several; else the one with most. ``turns_heading``,
-    ``known``: see ``checked_run``. Raises RadioDataError: it cannot be read, or has another format.
+    ``tag``, ``turns_heading``, ``known``: see ``checked_run``. Raises RadioDataError: it cannot be read, or has
+    another format.
     """
     data_format = found_format(path, data_format)
     if robot is not None and data_format != "mrclam":
         raise RadioDataError(path, f"a {data_format} set has one vehicle: leave out --robot")
-    if tag and data_format not in TAGGED:
-        raise RadioDataError(path, f"a {data_format} set names no tags: leave out --tag")
+    use_tag = ""
     try:
         if data_format == "mrclam":
             recording = read_mrclam(path, robot)
         elif data_format == "bag":
-            recording = read_bag(path, topics_file, tag)
+            recording, use_tag = read_bag(path, topics_file)
         else:
-            recording = read_columns(path, tag) if data_format == "columns" else READERS[data_format](path)
-        return checked_run(recording, turns_heading=turns_heading, known=known)
+            recording = READERS[data_format](path)
+        return checked_run(recording, turns_heading=turns_heading, known=known, tag=tag or use_tag)
     except RadioDataError as error:
         raise error.with_page() from error
 

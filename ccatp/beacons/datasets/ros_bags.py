@@ -15,7 +15,6 @@ from pydantic import Field, ValidationError
 
 from ccatp.beacons.datasets.events import Recording, name_of
 from ccatp.beacons.datasets.tables import RadioDataError, tables_of
-from ccatp.beacons.datasets.tags import chosen_tag
 from ccatp.config.files import read_input
 from ccatp.config.models import Model
 
@@ -69,7 +68,7 @@ class Topics(Model):
     markers: MarkersTopic | None = None
     antenna_m: _Place = (0.0, 0.0, 0.0)  # forward, left and up from the origin of the vehicle
     tags: dict[str, _Place] = Field(default_factory=dict)  # the same of each of several radios
-    use_tag: str = ""  # the one that is used; empty: the one with most readings
+    use_tag: str = ""  # the only one that is used; empty: all whose place is given
     beacons: dict[str, _Place] = Field(default_factory=dict)
 
 
@@ -78,39 +77,36 @@ Row = tuple[str, int, list[float]]
 
 
 class _Found:
-    """What the messages of a bag have: rows by kind, names of beacons, readings by tag, surveyed places."""
+    """What the messages of a bag have: rows by kind, names of beacons and tags, surveyed places."""
 
     def __init__(self) -> None:
         self.numbers: dict[str, float] = {}
+        self.tags: dict[str, float] = {}
         self.rows: list[Row] = []
-        self.by_tag: dict[str, list[Row]] = {}
         self.places: dict[str, tuple[float, ...]] = {}
 
 
-def read_bag(path: Path, topics_file: Path | None, tag: str = "") -> Recording:
-    """Read a run. Times are those of the message headers, or of the recorder for messages without one.
+def read_bag(path: Path, topics_file: Path | None) -> tuple[Recording, str]:
+    """Read a run, and ``use_tag``. Times are those of the message headers, or of the recorder if there are none.
 
-    ``tag``: in place of ``use_tag``. Raises RadioDataError: rosbags is not installed, or the bag or its
-    topics are invalid.
+    Raises RadioDataError: rosbags is not installed, or the bag or its topics are invalid.
     """
     if topics_file is None:
         raise RadioDataError(path, "is a bag: give a TOML file that names its topics with --topics")
     topics, warnings = read_topics(topics_file), list[str]()
     found = _read(path, topics, warnings)
-    counts = {name: len(rows) for name, rows in found.by_tag.items()}
-    tag = chosen_tag(path, counts, tag or topics.use_tag, warnings)
-    if tag and topics.tags and tag not in topics.tags:
-        warnings.append(f"the place of tag {tag} is not given: antenna_m is taken")
-    rows = found.rows + found.by_tag.get(tag, [])
+    rows = found.rows
     for name, place in {**found.places, **topics.beacons}.items():
         rows.append(("beacon", 0, [_number(found.numbers, name), *place, *[np.nan] * (3 - len(place))]))
-    antenna_m = topics.tags.get(tag, topics.antenna_m)
-    if any(antenna_m):
-        rows.append(("antenna", 0, [*antenna_m, *[0.0] * (3 - len(antenna_m))]))
+    for name, place in topics.tags.items():
+        rows.append(("tag", 0, [_number(found.tags, name), *place, *[0.0] * (3 - len(place))]))
+    if any(topics.antenna_m):
+        rows.append(("antenna", 0, [*topics.antenna_m, *[0.0] * (3 - len(topics.antenna_m))]))
     tables = tables_of(path, rows)
     if (poses := tables.get("pose")) is not None and np.isnan(poses.values[:, 3]).all():
         raise RadioDataError(path, f"{topics.odometry.topic} has no orientations: no odometry comes from it")
-    return Recording(path, name_of(path), "csv", tables, tuple(found.numbers), tuple(warnings))
+    names, tags = tuple(found.numbers), tuple(found.tags)
+    return Recording(path, name_of(path), "csv", tables, names, tuple(warnings), tags), topics.use_tag
 
 
 def read_topics(file: Path) -> Topics:
@@ -165,8 +161,8 @@ def _take_readings(topic: ReadingsTopic, message: Any, time_s: float, line: int,
         for kind in ("range", "bearing", "rssi"):
             if field := getattr(topic, kind):
                 value = float(_field(one, field)) * (UNITS[topic.unit] if kind == "range" else 1.0)
-                row = kind, line, [time_s, _number(found.numbers, name), value]
-                found.by_tag.setdefault(tag, []).append(row)
+                by = _number(found.tags, tag) if tag else np.nan
+                found.rows.append((kind, line, [time_s, _number(found.numbers, name), value, by]))
 
 
 def _messages(path: Path, wanted: set[str], warnings: list[str]) -> Iterator[tuple[str, float, Any]]:

@@ -219,13 +219,14 @@ def read_table(file: Path, names: tuple[str, ...], *, more: bool = False) -> Tab
 
 
 def tagged_row(
-    file: Path, line: int, words: Sequence[str], layout: Mapping[str, tuple[str, ...]], names: dict[str, float]
-) -> tuple[str, int, list[float]]:
+    file: Path, line: int, words: Sequence[str], layout: Mapping[str, tuple[str, ...]], names: dict[str, float],
+    tags: dict[str, float] | None = None,
+) -> tuple[str, int, list[float]]:  # fmt: skip
     """Parse a line whose first word is its kind: (kind, line number, values of its columns).
 
-    ``layout``: columns by kind; those in parentheses are optional. The column ``beacon`` is a name, all others are
-    numbers. ``names``: number of each known name; new ones are added. Raises RadioDataError: unknown kind, or the
-    values do not fit the columns.
+    ``layout``: columns by kind; those in parentheses are optional. The columns ``beacon`` and ``tag`` are names, all
+    others are numbers. ``names``, ``tags``: number of each known beacon and tag; new ones are added. Raises
+    RadioDataError: unknown kind, or the values do not fit the columns.
     """
     kind, *cells = words
     if kind not in layout:
@@ -236,15 +237,17 @@ def tagged_row(
     if not needed_of(columns) <= len(cells) <= len(columns):
         raise RadioDataError(file, f"{len(cells)} values after {kind}, wanted {', '.join(columns)}", line)
     values = []
+    named = {"beacon": names, "tag": {} if tags is None else tags}
     for cell, column in zip(cells, columns, strict=False):
-        if column != "beacon":
+        what = column.strip("()")
+        if what not in named or (what != column and not cell):
             # Nothing was measured; a row without a time or a place means nothing.
             is_nothing = not cell and column not in UNOMITTABLE
-            values.append(np.nan if is_nothing else number(file, line, cell, column.strip("()")))
+            values.append(np.nan if is_nothing else number(file, line, cell, what))
         elif cell:
-            values.append(names.setdefault(beacon_name(cell), float(len(names))))
+            values.append(named[what].setdefault(beacon_name(cell), float(len(named[what]))))
         else:
-            raise RadioDataError(file, f"{kind} has no name of a beacon", line)
+            raise RadioDataError(file, f"{kind} has no name of a {what}", line)
     missing = 0.0 if kind in {"odom", "speed"} else np.nan  # no travel sideways; heading unknown
     return kind, line, values + [missing] * (len(columns) - len(values))
 

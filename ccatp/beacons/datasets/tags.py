@@ -1,22 +1,99 @@
-"""The radios of a vehicle that has several: the readings of one of them are used, at the place of that one."""
+"""The radios of a vehicle (tags): whose readings are used, and where each of them is on the vehicle."""
 
+from collections import Counter
 from collections.abc import Mapping
-from pathlib import Path
+from typing import NamedTuple
 
-from ccatp.beacons.datasets.tables import RadioDataError, listed
+import numpy as np
+
+from ccatp.beacons.datasets.events import READING_KINDS, Recording
+from ccatp.beacons.datasets.tables import RadioDataError, Table, listed
+
+MOST_TAGS = 16  # more names are no tags
+TAG = 3  # column of the tag in a table of readings, if it has one
+Place = tuple[float, float, float]  # forward_m, left_m, up_m
+NOWHERE: Place = (0.0, 0.0, 0.0)
+UNPLACED = "no place on the vehicle is given, by an event tag, a table of tag, forward, left, or [tags] of the topics"
 
 
-def chosen_tag(file: Path, counts: Mapping[str, int], wanted: str, warnings: list[str]) -> str:
-    """The tag whose readings are used: the wanted one, or the one with most; with a warning if there are others.
+class Radios(NamedTuple):
+    """The readings that are used, and their radios."""
 
-    ``counts``: number of readings by tag. Raises RadioDataError: there is no reading of the wanted one.
+    tables: dict[str, Table]  # of readings, shape (m, 4): the last column is the index of the radio
+    antenna_m: Place  # of the only radio; zero if there are several
+    tags_m: Mapping[str, Place]  # of each of several radios, in the order of their indices
+
+
+def radios_of(recording: Recording, wanted: str, warnings: list[str]) -> Radios:
+    """All radios whose place is known, or the ``wanted`` one; the others are named and left out.
+
+    If no place is known, the radio with most readings is used, at the place of the antenna, with a warning. Raises
+    RadioDataError: there is no reading of the wanted one, or a place cannot be used.
     """
+    readings = {kind: table for kind, table in recording.tables.items() if kind in READING_KINDS}
+    named = {kind: _names(table, recording.tags) for kind, table in readings.items()}
+    counts = Counter(name for each in named.values() for name in each)
+    if wanted and not any(counts):
+        raise RadioDataError(recording.file, f"has no column of tags, so none of tag {wanted}")
     if wanted and wanted not in counts:
-        raise RadioDataError(file, f"has no reading of tag {wanted}; there are {listed(list(counts)) or 'none'}")
-    tag = wanted or max(counts, key=lambda one: counts[one], default="")
-    if len(counts) > 1:
-        others = listed([f"{one} ({count})" for one, count in counts.items() if one != tag])
-        warnings.append(
-            f"readings of tag {tag} ({counts[tag]}) are used, those of the tags {others} are not: --tag chooses another"
+        raise RadioDataError(recording.file, f"has no reading of tag {wanted}; there are {_listed(counts)}")
+    if len(counts) > MOST_TAGS:
+        raise RadioDataError(
+            recording.file, f"has readings of {len(counts)} tags ({_listed(counts)}): are these the names of tags?"
         )
-    return tag
+    places_m, antenna_m = _places(recording), _antenna(recording.tables.get("antenna"))
+    placed = [name for name in counts if name in places_m]
+    used = [wanted] if wanted else placed or [max(counts, key=lambda name: counts[name], default="")]
+    if others := {name: count for name, count in counts.items() if name not in used}:
+        kept = f"readings of tag {used[0]} ({counts[used[0]]}) are used, those of the tags {_listed(others)} are not"
+        lacking = f"readings of the tags {_listed(others)} are not used: {UNPLACED}"
+        warnings.append(lacking if placed and not wanted else kept)
+    if (len(counts) > 1 or places_m) and used[0] not in places_m:
+        where = "zero" if antenna_m == NOWHERE else "that of the antenna"
+        warnings.append(f"the place of tag {used[0]} is taken as {where}: {UNPLACED}")
+    elif antenna_m != NOWHERE and used[0] in places_m:
+        warnings.append("the place of the antenna is not used: that of the tag is")
+    tables = {kind: _of_radios(table, named[kind], used) for kind, table in readings.items()}
+    if len(used) > 1:
+        return Radios(tables, NOWHERE, {name: places_m[name] for name in used})
+    return Radios(tables, places_m.get(used[0], antenna_m), {})
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return listed([f"{name or 'without a name'} ({count})" for name, count in counts.items()])
+
+
+def _names(table: Table, tags: tuple[str, ...]) -> list[str]:
+    if table.values.shape[1] <= TAG:
+        return [""] * len(table.values)
+    return ["" if np.isnan(k) else tags[int(k)] for k in table.values[:, TAG].tolist()]
+
+
+def _of_radios(table: Table, names: list[str], used: list[str]) -> Table:
+    index = np.array([used.index(name) if name in used else -1 for name in names], dtype=np.float64)
+    return table._replace(values=np.column_stack([table.values[:, :TAG], index])).where(index >= 0.0)
+
+
+def _places(recording: Recording) -> dict[str, Place]:
+    """Places of the tags, without those that are not given. Raises RadioDataError: a tag has two."""
+    table = recording.tables.get("tag")
+    found: dict[str, Place] = {}
+    if table is None:
+        return found
+    for line, (tag, *place) in zip(table.lines.tolist(), table.values.tolist(), strict=True):
+        ahead_m, left_m, up_m = np.nan_to_num(place).tolist()
+        name, place_m = recording.tags[int(tag)], (ahead_m, left_m, up_m)
+        if found.get(name, place_m) != place_m:
+            raise RadioDataError(table.file, f"tag {name} has two places", line)
+        if np.isfinite(place[:2]).all():
+            found[name] = place_m
+    return found
+
+
+def _antenna(mounted: Table | None) -> Place:
+    if mounted is None:
+        return NOWHERE
+    if len(mounted.values) > 1 or not np.isfinite(mounted.values[0, :2]).all():
+        raise RadioDataError(mounted.file, "more than one antenna, or one at no place", int(mounted.lines[-1]))
+    ahead_m, left_m, up_m = np.nan_to_num(mounted.values[0]).tolist()
+    return ahead_m, left_m, up_m

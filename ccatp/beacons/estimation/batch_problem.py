@@ -229,12 +229,12 @@ class MarginalPrior:
 
 
 class BeaconNoise(NamedTuple):
-    """Noise of ranges by beacon, as estimated from residuals."""
+    """Noise of ranges by beacon and radio, as estimated from residuals; indices are those of ``Readings.heard``."""
 
-    variance: FloatArray  # factor on the configured variance, shape (b,)
-    repeats: FloatArray  # number of readings that count as one, because errors last, shape (b,)
-    share: FloatArray  # of the variance that lasts, shape (b,)
-    lasts_s: FloatArray  # its correlation time, s, shape (b,)
+    variance: FloatArray  # factor on the configured variance, shape (t b,) for t radios
+    repeats: FloatArray  # number of readings that count as one, because errors last, shape (t b,)
+    share: FloatArray  # of the variance that lasts, shape (t b,)
+    lasts_s: FloatArray  # its correlation time, s, shape (t b,)
 
     @classmethod
     def configured(cls, count: int) -> "BeaconNoise":
@@ -306,10 +306,11 @@ class BatchProblem:
         self.there = np.isfinite(read) & used[readings.beacon][:, None]
         self.sizes: FloatArray = self.there.sum(axis=1).astype(np.float64)
         self._read = np.where(self.there, read, 0.0)
-        self.repeats = repeats(readings, settings.radio.correlation_s)
+        self.heard = readings.heard(used.size)
+        self.repeats = repeats(readings.times_s, self.heard, settings.radio.correlation_s)
         # Readings whose errors last are counted less, but their outliers are recognized by their own noise.
-        self.power = np.ones(len(readings.times_s)) if noise is None else 1.0 / noise.repeats[readings.beacon]
-        self._range_factor = 1.0 if noise is None else noise.variance[readings.beacon]
+        self.power = np.ones(len(readings.times_s)) if noise is None else 1.0 / noise.repeats[self.heard]
+        self._range_factor = 1.0 if noise is None else noise.variance[self.heard]
         self.free, self.prior_information = of_priors(priors, used)
         self.marginal = marginal
         rest_s, rest_rad = self.reckoning.at_rest
@@ -436,7 +437,8 @@ class BatchProblem:
         by_steps = np.concatenate([by_poses, -by_calibration], axis=2)
 
         pose, beacon = state.poses[self.at], state.beacons[self.readings.beacon]
-        dx, dy = beacon[:, 0] - pose[:, 0], beacon[:, 1] - pose[:, 1]
+        at_m = self.readings.radios_at(pose)
+        dx, dy = beacon[:, 0] - at_m[:, 0], beacon[:, 1] - at_m[:, 1]
         shared, radio, m = state.shared, self.radio, len(dx)
         reference_dbm = radio.rssi_reference_dbm + shared[RSSI_REFERENCE] + beacon[:, 3]
         exponent = radio.rssi_exponent + shared[RSSI_EXPONENT]
@@ -452,6 +454,9 @@ class BatchProblem:
         by_beacon[:, :, :2] = np.array((by_range, by_bearing, by_level)).transpose(2, 0, 1)
         by_beacon[:, 0, 2] = by_beacon[:, 2, 3] = 1.0
         by_pose[:, :, :2], by_pose[:, 1, 2] = -by_beacon[:, :, :2], -1.0
+        if self.readings.arm_m is not None:  # the radio moves by (-y, x) of its lever arm when the vehicle turns
+            x_m, y_m = (at_m - pose[:, :2]).T
+            by_pose[:, :, 2] += by_beacon[:, :, 0] * y_m[:, None] - by_beacon[:, :, 1] * x_m[:, None]
         by_shared = np.zeros((m, 3, len(OF_READINGS)))
         by_shared[:, 0, 0], by_shared[:, 0, 1], by_shared[:, 1, 2] = r, 1.0, 1.0
         by_shared[:, 2, 3], by_shared[:, 2, 4] = 1.0, by_exponent
@@ -495,16 +500,18 @@ def _squares(J: FloatArray, WJ: FloatArray, e: FloatArray) -> tuple[FloatArray, 
     return J.transpose(0, 2, 1) @ WJ, -np.einsum("krc,kr->kc", WJ, e)
 
 
-def repeats(readings: Readings, correlation_s: float) -> FloatArray:
-    """Number of readings of the same beacon in the interval ``correlation_s`` centred on each reading, shape (m,).
+def repeats(times_s: FloatArray, heard: IntArray, correlation_s: float) -> FloatArray:
+    """Number of readings in the interval ``correlation_s`` centred on each reading, shape (m,).
+
+    Counted are those of the same beacon by the same radio, as ``heard`` (m,) tells.
 
     Persistent errors (of a camera, of a reflection) do not average out. If the variance of each reading is multiplied
     by this number, all readings of such an interval together have the weight of one, at any rate.
     """
-    counts = np.ones(len(readings.times_s))
-    for beacon in np.unique(readings.beacon) if correlation_s > 0.0 else ():
-        rows = np.flatnonzero(readings.beacon == beacon)
-        t = readings.times_s[rows]
+    counts = np.ones(len(times_s))
+    for one in np.unique(heard) if correlation_s > 0.0 else ():
+        rows = np.flatnonzero(heard == one)
+        t = times_s[rows]
         half = 0.5 * correlation_s
         counts[rows] = np.searchsorted(t, t + half, "right") - np.searchsorted(t, t - half, "left")
     return counts

@@ -1,13 +1,13 @@
 """Beacons as blocks of the filter's state, wandering errors, learned noise levels, and the transport of the heading."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import exp
 
 import numpy as np
 from scipy.linalg.blas import daxpy
 
-from ccatp.beacons.estimation.recording import BeaconId
+from ccatp.beacons.estimation.recording import BeaconId, Radio
 from ccatp.beacons.filters.ekf_slam import Columns, EkfSlam, columns_of
 from ccatp.core import FloatArray
 
@@ -99,18 +99,35 @@ WANDER = "wander"  # first part of the name of a block that holds a wandering er
 
 
 @dataclass(slots=True)
-class MapEntry:
-    """A beacon on the map. ``way_m``, ``time_s``: distance travelled and time of the wandering error's last update."""
+class RadioErrors:
+    """Errors of a beacon's readings by one radio.
+
+    ``way_m``, ``time_s``: distance travelled and time of the wandering error's last update.
+    """
 
     columns: Columns  # the columns shared by all beacons, then the beacon and its wandering error, shape (k,)
-    size: int
     wander: int = -1  # column of the wandering error; -1: none
     way_m: float = 0.0
     time_s: float = 0.0
     fresh: float = 1.0  # variance of the new part of the wandering error, in sigmas squared
+    noise: LearnedNoise | None = None  # of the ranges; None: that of the settings, with the level of all beacons
+
+
+@dataclass(slots=True)
+class MapEntry:
+    """A beacon on the map."""
+
+    size: int
+    columns: Columns = field(default_factory=lambda: _NONE)  # shared by all beacons, then the beacon, shape (k,)
+    radios: dict[Radio | None, RadioErrors] = field(default_factory=dict)
     refused: int = 0  # readings refused in a row
-    noise: LearnedNoise | None = None  # of its ranges; None: that of the settings, with the level of all beacons
     on_trial: int = 0  # number of readings that must still agree with the first one; 0: the trial is over
+
+    def heard_by(self, radio: Radio | None) -> RadioErrors:
+        """The errors of the readings of a radio."""
+        if radio not in self.radios:
+            self.radios[radio] = RadioErrors(self.columns)
+        return self.radios[radio]
 
 
 class BeaconMap(dict[BeaconId, MapEntry]):
@@ -123,15 +140,14 @@ class BeaconMap(dict[BeaconId, MapEntry]):
     def join(self, beacon: BeaconId, mean: FloatArray, covariance: FloatArray) -> MapEntry:
         """Add a beacon that is not correlated with the rest of the state: mean (b,), covariance (b, b)."""
         self._append(beacon, mean, covariance)
-        self[beacon] = MapEntry(_NONE, mean.size)
+        self[beacon] = MapEntry(mean.size)
         self.renumber()
         return self[beacon]
 
     def leave(self, beacon: BeaconId) -> None:
         """Remove a beacon. Raises BlockError: it is not on the map."""
-        self._engine.remove(beacon)
-        if (WANDER, beacon) in self._engine:
-            self._engine.remove((WANDER, beacon))
+        wanders = [(WANDER, beacon, radio) for radio, heard in self[beacon].radios.items() if heard.wander >= 0]
+        self._engine.remove(beacon, *wanders)
         del self[beacon]
         self.renumber()
 
@@ -139,23 +155,30 @@ class BeaconMap(dict[BeaconId, MapEntry]):
         """Update the columns of all entries, after a block was added or removed."""
         engine = self._engine
         for beacon, entry in self.items():
-            parts = [engine.block(beacon)]
-            if (WANDER, beacon) in engine:
-                parts.append(engine.block((WANDER, beacon)))
-                entry.wander = parts[-1].start
-            entry.columns = columns_of(self._shared, *parts)
+            place = engine.block(beacon)
+            entry.columns = columns_of(self._shared, place)
+            for radio, heard in entry.radios.items():
+                heard.columns = entry.columns
+                if (WANDER, beacon, radio) in engine:
+                    wander = engine.block((WANDER, beacon, radio))
+                    heard.wander, heard.columns = wander.start, columns_of(self._shared, place, wander)
 
-    def wander_to(self, beacon: BeaconId, model: GaussMarkovBias, way_m: float, time_s: float) -> None:
-        """Predict a beacon's wandering error, in sigmas: w <- phi w, variance <- phi^2 variance + 1 - phi^2."""
-        entry = self[beacon]
-        if entry.wander < 0:
-            self._append((WANDER, beacon), np.zeros(1), np.eye(1))
+    def wander_to(
+        self, beacon: BeaconId, radio: Radio | None, model: GaussMarkovBias, way_m: float, time_s: float
+    ) -> None:
+        """Predict the wandering error of a beacon's readings by a radio, in sigmas.
+
+        w <- phi w, variance <- phi^2 variance + 1 - phi^2.
+        """
+        heard = self[beacon].heard_by(radio)
+        if heard.wander < 0:
+            self._append((WANDER, beacon, radio), np.zeros(1), np.eye(1))
             self.renumber()
         else:
-            phi = exp(-(way_m - entry.way_m) / model.length_m - max(time_s - entry.time_s, 0.0) / model.time_s)
-            entry.fresh = 1.0 - phi * phi
-            self._engine.relax(entry.wander, phi, entry.fresh)
-        entry.way_m, entry.time_s = way_m, time_s
+            phi = exp(-(way_m - heard.way_m) / model.length_m - max(time_s - heard.time_s, 0.0) / model.time_s)
+            heard.fresh = 1.0 - phi * phi
+            self._engine.relax(heard.wander, phi, heard.fresh)
+        heard.way_m, heard.time_s = way_m, time_s
 
     def _append(self, block: object, mean: FloatArray, covariance: FloatArray) -> None:
         b = mean.size

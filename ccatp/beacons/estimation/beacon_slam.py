@@ -19,6 +19,7 @@ from ccatp.beacons.estimation.beacon_map import (
     LearnedNoise,
     MapEntry,
     NoiseLevel,
+    RadioErrors,
 )
 from ccatp.beacons.estimation.landmark_init import (
     AGAIN,
@@ -44,11 +45,12 @@ from ccatp.beacons.estimation.motion import (
     DifferentialDrive,
     Increment,
     Odometry,
+    RadioPose,
     SlippingVehicle,
     VehiclePose,
     estimated,
 )
-from ccatp.beacons.estimation.recording import BeaconEstimate, BeaconId, KnownMap, Reading
+from ccatp.beacons.estimation.recording import BeaconEstimate, BeaconId, KnownMap, Radio, Reading
 from ccatp.beacons.filters.ekf_slam import BlockError, Columns, EkfSlam, RowUpdate, columns_of
 from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
@@ -66,6 +68,7 @@ class BeaconInnovation(msgspec.Struct, frozen=True, gc=False):
     size: int  # number of scalars processed (bearing, range, strength); one if the bearing was refused
     accepted: bool  # False: refused; the state is then unchanged, or was updated by the bearing only
     surprise: float = 0.0  # minus twice its log-likelihood, up to a constant: sum of nis + ln S
+    radio: Radio | None = None
 
 
 class BeaconSlam:
@@ -251,10 +254,13 @@ class BeaconSlam:
         waiting.drop(self.engine)
         self._map.renumber()
 
-    def take_noise(self, beacon: BeaconId, variance: float, share: float, lasts_s: float) -> None:
-        """Use a noise of a beacon's ranges: factor on the configured variance, share that lasts, correlation time."""
+    def take_noise(self, beacon: BeaconId, radio: Radio | None, variance: float, share: float, lasts_s: float) -> None:
+        """Use a noise of a beacon's ranges by a radio.
+
+        Factor on the configured variance, share that lasts, correlation time.
+        """
         if beacon in self._map and (share > 0.0 or self._wander is None):
-            self._map[beacon].noise = LearnedNoise(variance, GaussMarkovBias(share, inf, lasts_s))
+            self._map[beacon].heard_by(radio).noise = LearnedNoise(variance, GaussMarkovBias(share, inf, lasts_s))
 
     def _columns(self, names: Sequence[str], beacons: Sequence[BeaconId]) -> Columns:
         calibration = [POSE + self._names.index(name) for name in names]
@@ -277,12 +283,13 @@ class BeaconSlam:
         kind, z = scalars_of(reading)[-1]
         model = self._models.by_kind[kind]
         reach_m, at = model.distance_m(z, name), self._at(reading.time_s)
+        there = RadioPose.at(at.pose, reading.radio)
         waiting = self.waiting.setdefault(name, PendingLandmark(name))
         record = ReadingRecord(reading, ("place", name, waiting.count), reach_m)
         if reading.bearing_rad is not None:
-            waiting.take(engine, record, *self._clone(at, POSE))
-        elif waiting.is_apart(engine, at.pose, reach_m):
-            waiting.take(engine, record, *self._clone(at, PLACE))
+            waiting.take(engine, record, *self._clone(at, there, POSE))
+        elif waiting.is_apart(engine, record, there.pose):
+            waiting.take(engine, record, *self._clone(at, there, PLACE))
             waiting.thin(engine)
         else:
             return
@@ -309,12 +316,12 @@ class BeaconSlam:
     def _look(self, waiting: PendingLandmark) -> None:
         waiting.look(self.engine, self._stacked(waiting), partial(self._prior_at, waiting))
 
-    def _clone(self, at: CarriedOdometry, size: int) -> tuple[FloatArray, Columns, FloatArray]:
-        """Copy of a pose or its place, (size,); the columns it depends on; its derivatives by these, (size, k)."""
+    def _clone(self, at: CarriedOdometry, there: RadioPose, size: int) -> tuple[FloatArray, Columns, FloatArray]:
+        """Copy of a radio's pose or place, (size,); the columns it depends on; its derivatives by these, (size, k)."""
         is_delayed = self._delay >= 0
-        J = [at.derivatives(*unit, delayed=is_delayed) for unit in UNITS[:size]]
+        J = [at.derivatives(*there.turned(*unit), delayed=is_delayed) for unit in UNITS[:size]]
         columns = columns_of(range(POSE), (self._delay,) if is_delayed else ())
-        return np.array(at.pose[:size]), columns, np.array(J)
+        return np.array(there.pose[:size]), columns, np.array(J)
 
     def _stacked(self, waiting: PendingLandmark) -> StackedRows:
         def row_of(kind: str, pose: list[float], calibration: list[float], beacon: list[float]) -> MeasurementRow:
@@ -350,29 +357,30 @@ class BeaconSlam:
 
     def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
         """Process the bearing first; if it is refused, the rest of the reading is refused, too."""
-        bias = self._wander if entry.noise is None else entry.noise.bias
-        if bias is not None and (bias.share > 0.0 or entry.wander >= 0) and not is_direction(reading):
-            self._map.wander_to(reading.beacon, bias, self._way_m, reading.time_s)
+        heard = entry.heard_by(reading.radio)
+        bias = self._wander if heard.noise is None else heard.noise.bias
+        if bias is not None and (bias.share > 0.0 or heard.wander >= 0) and not is_direction(reading):
+            self._map.wander_to(reading.beacon, reading.radio, bias, self._way_m, reading.time_s)
         nis, spread, size, accepted = 0.0, 1.0, 0, True
         for kind, z in scalars_of(reading):
             if accepted:
-                found = self._take(reading, entry, kind, z)
+                found = self._take(reading, entry.size, heard, kind, z)
                 nis, spread, size, accepted = nis + found.nis, spread * found.spread, size + 1, found.accepted
         if self._learns:
             self._fresh.clear()
         self._judge(reading, entry, accepted=accepted)
-        return BeaconInnovation(reading.beacon, nis, size, accepted, nis + log(spread))
+        return BeaconInnovation(reading.beacon, nis, size, accepted, nis + log(spread), reading.radio)
 
-    def _take(self, reading: Reading, entry: MapEntry, kind: str, z: float) -> RowUpdate:
-        engine, columns = self.engine, entry.columns
+    def _take(self, reading: Reading, size: int, heard: RadioErrors, kind: str, z: float) -> RowUpdate:
+        engine, columns = self.engine, heard.columns
         prior = engine.mean[columns]
-        h, residual, r, own = self._linearised(reading, entry, kind, z, prior.tolist())
+        h, residual, r, own = self._linearised(reading, size, heard, kind, z, prior.tolist())
         if self._iterations > 1:
             P = engine.covariance[np.ix_(columns, columns)]
             for _ in range(self._iterations - 1):
                 Ph = P.dot(h)
                 x = prior + Ph * (residual / (float(Ph.dot(h)) + r))
-                h, residual, r, own = self._linearised(reading, entry, kind, z, x.tolist())
+                h, residual, r, own = self._linearised(reading, size, heard, kind, z, x.tolist())
                 residual += float((x - prior).dot(h))
         found = engine.update_row(columns, np.array(h), residual, r, self._gate, self._knee)
         if found.accepted and self._learns:
@@ -381,29 +389,30 @@ class BeaconSlam:
         return found
 
     def _linearised(
-        self, reading: Reading, entry: MapEntry, kind: str, z: float, x: list[float]
+        self, reading: Reading, size: int, heard: RadioErrors, kind: str, z: float, x: list[float]
     ) -> tuple[list[float], float, float, float]:
-        """Derivatives by the entry's columns, residual, variance of the white noise, and of all noise of the reading.
+        """Derivatives by the columns of ``heard``, residual, variance of the white noise, and of all noise.
 
         The last one includes the part of the wandering error that is new since the previous reading.
         """
         is_delayed, shown = self._delay >= 0, self._shown
         at = self._clock.at(x, reading.time_s, x[POSE] if is_delayed else 0.0)
-        calibration, beacon = x[shown - self._ranges : shown], x[shown : shown + entry.size]
-        row = self._models.by_kind[kind].row(at.pose, calibration, beacon, reading.beacon)
-        h = [*at.derivatives(*row.pose, delayed=is_delayed), *row.calibration, *row.beacon]
+        calibration, beacon = x[shown - self._ranges : shown], x[shown : shown + size]
+        there = RadioPose.at(at.pose, reading.radio)
+        row = self._models.by_kind[kind].row(there.pose, calibration, beacon, reading.beacon)
+        h = [*at.derivatives(*there.turned(*row.pose), delayed=is_delayed), *row.calibration, *row.beacon]
         expected = row.expected
-        is_learned = entry.noise is not None and kind == "range"
-        bias = entry.noise.bias if entry.noise is not None and is_learned else self._wander
-        level = entry.noise.variance if entry.noise is not None and is_learned else self.levels[kind].factor
+        is_learned = heard.noise is not None and kind == "range"
+        bias = heard.noise.bias if heard.noise is not None and is_learned else self._wander
+        level = heard.noise.variance if heard.noise is not None and is_learned else self.levels[kind].factor
         r = own = row.variance * level
-        if entry.wander >= 0:
+        if heard.wander >= 0:
             share = 0.0 if bias is None or kind == "bearing" else bias.share
             by_wander = sqrt(share * r)
             h.append(by_wander)
             expected += by_wander * x[-1]
             r *= 1.0 - share
-            own = r + entry.fresh * by_wander * by_wander
+            own = r + heard.fresh * by_wander * by_wander
         residual = wrap_pi(z - expected) if kind == "bearing" else z - expected
         return h, residual, r, own
 

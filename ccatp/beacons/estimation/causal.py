@@ -222,7 +222,9 @@ def _result(run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig
         scalar_s=np.array(log.scalar_s),
         map_covariance=slam.engine.covariance[np.ix_(at, at)],
         innovations=tuple(
-            ReadingInnovation(time_s, str(one.beacon), one.nis, one.size, one.accepted)
+            ReadingInnovation(
+                time_s, str(one.beacon), one.nis, one.size, one.accepted, one.radio.name if one.radio else ""
+            )
             for time_s, one in zip(log.times_s, log.learned, strict=True)
         ),
     )  # fmt: skip
@@ -281,8 +283,12 @@ def _increments(steps: Steps, times_s: FloatArray) -> list[Increment]:
 
 def _readings(run: RecordedRun, camera_field_rad: float) -> Iterator[Reading]:
     r = run.readings.with_distances(camera_field_rad)
-    for time_s, beacon, range_m, bearing_rad, rssi_dbm in zip(*(column.tolist() for column in r), strict=True):
+    radios = [None] * len(r.times_s) if r.tag is None else [run.tags[k] for k in r.tag.tolist()]
+    columns = (r.times_s, r.beacon, r.range_m, r.bearing_rad, r.rssi_dbm)
+    for time_s, beacon, range_m, bearing_rad, rssi_dbm, radio in zip(
+        *(column.tolist() for column in columns), radios, strict=True
+    ):
         bearing = None if math.isnan(bearing_rad) else bearing_rad
         level_dbm = rssi_dbm if math.isnan(range_m) else math.nan
         if not (bearing is None and math.isnan(range_m) and math.isnan(level_dbm)):
-            yield Reading(time_s, run.beacon_ids[beacon], range_m, bearing, level_dbm)
+            yield Reading(time_s, run.beacon_ids[beacon], range_m, bearing, level_dbm, radio)

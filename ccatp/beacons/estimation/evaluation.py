@@ -174,6 +174,8 @@ def table_lines(run: RecordedRun, data: dict[str, Any]) -> list[str]:
     span_s = run.steps.times_s[-1] - run.steps.times_s[0]
     way_m = float(np.abs(run.steps.distance_m).sum())
     readings = f"{len(run.readings.times_s)} readings of {len(run.beacon_ids)} beacons"
+    if run.tags:
+        readings += f" by {len(run.tags)} tags"
     rows = [
         ("data", f"{data['dataset']} ({data['format']}): {span_s:.0f} s, {way_m:.0f} m by odometry, {readings}"),
         ("filter", f"{data['filter']}: {data['updates']} updates, {data['refused']} refused"),

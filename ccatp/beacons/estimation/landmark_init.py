@@ -1,5 +1,6 @@
 """Initialisation of beacons: readings wait with copies of the poses where they were taken, until the place is known."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import cos, hypot, inf, isfinite, pi, sin, sqrt
@@ -125,12 +126,16 @@ class PendingLandmark:
     spacing_m: float = 0.0
     count: int = 0
 
-    def is_apart(self, engine: EkfSlam, place: Sequence[float], range_m: float) -> bool:
-        """Whether a place is at least the spacing away from the last reading that was kept."""
+    def is_apart(self, engine: EkfSlam, record: ReadingRecord, place: Sequence[float]) -> bool:
+        """Whether a place is at least the spacing away from the last reading of the same radio that was kept."""
         if not self.records:
-            self.spacing_m = SPACING * range_m
+            self.spacing_m = SPACING * record.distance_m
             return True
-        last_x, last_y = engine.mean[engine.block(self.records[-1].place)][:2].tolist()
+        radio = record.reading.radio
+        last = next((one for one in reversed(self.records) if one.reading.radio == radio), None)
+        if last is None:
+            return True
+        last_x, last_y = engine.mean[engine.block(last.place)][:2].tolist()
         return hypot(place[0] - last_x, place[1] - last_y) >= self.spacing_m
 
     def take(self, engine: EkfSlam, record: ReadingRecord, pose: FloatArray, columns: Columns, J: FloatArray) -> None:
@@ -140,11 +145,15 @@ class PendingLandmark:
         self.records.append(record)
 
     def thin(self, engine: EkfSlam) -> None:
-        """If there are more than MOST readings, drop every other one."""
+        """If there are more than MOST readings, drop every other one of each radio."""
         if len(self.records) > MOST:
             self.spacing_m *= 2.0
-            engine.remove(*(record.place for record in self.records[1::2]))
-            self.records = self.records[::2]
+            halves, of_radio = (list[ReadingRecord](), list[ReadingRecord]()), Counter[object]()
+            for record in self.records:
+                halves[of_radio[record.reading.radio] % 2].append(record)
+                of_radio[record.reading.radio] += 1
+            engine.remove(*(record.place for record in halves[1]))
+            self.records = halves[0]
 
     def drop(self, engine: EkfSlam) -> None:
         """Remove all readings and their clones."""

@@ -15,6 +15,7 @@ from ccatp.beacons.config.models import (
     SlamFilterConfig,
     VehicleConfig,
 )
+from ccatp.beacons.estimation.recording import Radio
 from ccatp.core import FloatArray
 
 POSE = 3  # x_m, y_m, heading_rad: the first states of a vehicle
@@ -275,6 +276,27 @@ class CarriedOdometry(msgspec.Struct, frozen=True, gc=False):
         turned += self.back_s * (hx * vy - hy * vx)
         # the delay changes the heading at the rate ``turn``, too
         return [hx, hy, turned, -hx * vx - hy * vy - turn * turned] if delayed else [hx, hy, turned]
+
+
+class RadioPose(NamedTuple):
+    """A radio on the vehicle: its place and the vehicle's heading, and how the place depends on the heading."""
+
+    pose: list[float]  # x_m, y_m of the radio, heading_rad
+    by_heading: tuple[float, float]  # derivatives of its x_m and y_m by the heading
+
+    @classmethod
+    def at(cls, pose: list[float], radio: Radio | None) -> "RadioPose":
+        """Of a vehicle at a pose. ``radio``: None: it is at the pose."""
+        if radio is None:
+            return cls(pose, (0.0, 0.0))
+        c, s = cos(pose[2]), sin(pose[2])
+        x, y = c * radio.ahead_m - s * radio.left_m, s * radio.ahead_m + c * radio.left_m
+        return cls([pose[0] + x, pose[1] + y, pose[2]], (-y, x))
+
+    def turned(self, hx: float, hy: float, turned: float) -> tuple[float, float, float]:
+        """Derivatives by the vehicle's x, y and heading, from those by the radio's."""
+        dx, dy = self.by_heading
+        return hx, hy, turned + hx * dx + hy * dy
 
 
 class DeadReckoning:

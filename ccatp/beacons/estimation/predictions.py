@@ -39,7 +39,9 @@ def predicted(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -
     turned = track.poses[before, 2] - then[:, 2]
     (dx, dy), c, s = (now - then)[:, :2].T, np.cos(turned), np.sin(turned)
     ahead = track.poses[before, :2] + np.column_stack([c * dx - s * dy, s * dx + c * dy])
-    aligned = best_motion(now[:, :2], ahead).moved(now[:, :2])
+    alignment = best_motion(now[:, :2], ahead)
+    aligned = r.radios_at(np.column_stack([alignment.moved(now[:, :2]), now[:, 2] + alignment.angle_rad]))
+    ahead = r.radios_at(np.column_stack([ahead, now[:, 2] + turned]))
     places = np.array([track.beacons[name][:2] if name in track.beacons else (np.nan, np.nan) for name in names])
     scale, offset_m = (track.calibration.get(name, _NONE).value for name in ("range_scale", "range_offset_m"))
     range_m = (r.range_m - offset_m) / (1.0 + scale)

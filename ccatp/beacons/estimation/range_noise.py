@@ -17,26 +17,26 @@ MOST_SHARE, LONGEST = 0.95, 0.995  # of the variance that lasts; correlation of 
 SCALINGS = 10  # iterations of the scale of Student's t
 
 
-def range_noise(problem: BatchProblem, state: BatchState) -> BeaconNoise:
-    """The noise of each beacon; the configured one where there are too few readings."""
-    noise = BeaconNoise.configured(len(problem.used))
+def range_noise(problem: BatchProblem, state: BatchState, radios: int = 1) -> BeaconNoise:
+    """The noise of each beacon by each radio; the configured one where there are too few readings."""
+    noise = BeaconNoise.configured(problem.used.size * radios)
     off_m = problem.residuals(state).readings[:, 0]
     sigmas = np.sqrt(range_variance(problem.radio, problem.readings.range_m))
-    for beacon in np.flatnonzero(problem.used).tolist():
-        rows = np.flatnonzero((problem.readings.beacon == beacon) & problem.there[:, 0])
+    for heard in range(len(noise.variance)):
+        rows = np.flatnonzero((problem.heard == heard) & problem.there[:, 0])
         if rows.size < FEWEST:
             continue
         e = off_m[rows] / sigmas[rows]
         square = _scale(e, problem.radio.freedom)
         rho = correlations(np.clip(e / np.sqrt(square), -CLIPPED, CLIPPED))
         if rho[1] > SURE / np.sqrt(rows.size):
-            noise.repeats[beacon] = repeats = readings_as_one(rho)
+            noise.repeats[heard] = repeats = readings_as_one(rho)
             # rho_k = share phi^k, whose sum over k is share phi / (1 - phi)
             phi = min(max(1.0 - 2.0 * float(rho[1]) / max(repeats - 1.0, 1e-9), 0.1), LONGEST)
-            noise.share[beacon] = min(float(rho[1]) / phi, MOST_SHARE)
-            noise.lasts_s[beacon] = -float(np.median(np.diff(problem.readings.times_s[rows]))) / log(phi)
-        count = rows.size / noise.repeats[beacon]
-        noise.variance[beacon] = max((ASSUMED + count * square) / (ASSUMED + count), LEAST)
+            noise.share[heard] = min(float(rho[1]) / phi, MOST_SHARE)
+            noise.lasts_s[heard] = -float(np.median(np.diff(problem.readings.times_s[rows]))) / log(phi)
+        count = rows.size / noise.repeats[heard]
+        noise.variance[heard] = max((ASSUMED + count * square) / (ASSUMED + count), LEAST)
     return noise
 
 

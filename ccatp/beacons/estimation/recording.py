@@ -28,6 +28,14 @@ class Steps(NamedTuple):
     guess_rad2: FloatArray | float = 0.0  # variance of its turn, in the same case, rad^2
 
 
+class Radio(NamedTuple):
+    """One of several radios of a vehicle, a tag."""
+
+    name: str
+    ahead_m: float  # of the point whose path is estimated
+    left_m: float
+
+
 class Readings(NamedTuple):
     """Readings of beacons, one a row, in order of time."""
 
@@ -36,12 +44,25 @@ class Readings(NamedTuple):
     range_m: FloatArray  # shape (m,), m; NaN where none was measured
     bearing_rad: FloatArray  # from the heading, counter-clockwise, rad, shape (m,); NaN where none was measured
     rssi_dbm: FloatArray  # signal strength, dBm, shape (m,); NaN where none was measured
+    # Of a vehicle with several radios (tags), else None: which of ``RecordedRun.tags`` each reading is of, shape (m,),
+    # and where that is on the vehicle: ahead and left of the point whose path is estimated, m, shape (m, 2).
+    tag: IntArray | None = None
+    arm_m: FloatArray | None = None
 
     def where(self, rows: BoolArray | IntArray) -> "Readings":
         """The readings of a mask or of indices."""
         return Readings(
-            self.times_s[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows], self.rssi_dbm[rows]
-        )
+            self.times_s[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows], self.rssi_dbm[rows],
+            None if self.tag is None else self.tag[rows], None if self.arm_m is None else self.arm_m[rows],
+        )  # fmt: skip
+
+    def heard(self, beacons: int) -> IntArray:
+        """The pair of radio and beacon of each reading as a number, shape (m,): that of the beacon for one radio."""
+        return self.beacon if self.tag is None else self.beacon + beacons * self.tag
+
+    def radios_at(self, poses: FloatArray) -> FloatArray:
+        """Where the radio of each reading is, x_m, y_m, shape (m, 2), for poses of the vehicle (m, 3)."""
+        return np.asarray(poses[:, :2]) if self.arm_m is None else antenna_path(poses, self.arm_m)
 
     def with_distances(self, camera_field_rad: float) -> "Readings":
         """The readings of a camera that measures ranges by apparent height, with distances instead of depths.
@@ -114,6 +135,12 @@ class RecordedRun:
     warnings: tuple[str, ...]
     antenna_m: tuple[float, float] = (0.0, 0.0)  # ahead and left of the vehicle's origin; poses are the antenna's
     known_map: KnownMap | None = None
+    tags: tuple[Radio, ...] = ()  # the vehicle's radios, if the readings are of several: poses are the origin's then
+
+    @property
+    def radios(self) -> Sequence[Radio | None]:
+        """The radios as readings have them: ``None`` for the only one."""
+        return self.tags or (None,)
 
 
 def running_total(amounts: FloatArray) -> FloatArray:
@@ -134,13 +161,13 @@ def dead_reckoned(steps: Steps, first_pose: tuple[float, float, float]) -> Float
     return np.column_stack([x_m + running_total(dx), y_m + running_total(dy), headings])
 
 
-def antenna_path(poses: FloatArray, antenna_m: tuple[float, float], sign: float = 1.0) -> FloatArray:
+def antenna_path(poses: FloatArray, antenna_m: tuple[float, float] | FloatArray, sign: float = 1.0) -> FloatArray:
     """Antenna positions at poses of the vehicle, (n, 2); with ``sign`` -1, vehicle positions at poses of the antenna.
 
-    ``poses``: x_m, y_m, heading_rad, shape (n, 3).
+    ``poses``: x_m, y_m, heading_rad, shape (n, 3). ``antenna_m``: ahead and left, of one antenna, or shape (n, 2).
     """
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    ahead_m, left_m = antenna_m
+    ahead_m, left_m = np.asarray(antenna_m).T
     lever = np.column_stack([c * ahead_m - s * left_m, s * ahead_m + c * left_m])
     return np.asarray(poses[:, :2] + sign * lever)
 
@@ -177,6 +204,7 @@ class ReadingInnovation(NamedTuple):
     nis: float
     size: int  # degrees of freedom
     is_used: bool
+    tag: str = ""  # that read it, if there are several
 
 
 class EstimatedPath(NamedTuple):
@@ -205,6 +233,10 @@ class EstimatedPath(NamedTuple):
     map_covariance: FloatArray = np.empty((0, 0))  # of all beacons' x_m, y_m in their order, shape (2 b, 2 b)
     innovations: tuple[ReadingInnovation, ...] = ()  # of all readings of beacons on the map; empty from a smoother
 
+    def poses_at(self, at_s: FloatArray) -> FloatArray:
+        """Poses at other times, shape (m, 3), linear between two of its own."""
+        return np.column_stack([np.interp(at_s, self.times_s, column) for column in self.poses.T])
+
 
 BeaconId = int | str
 
@@ -217,6 +249,7 @@ class Reading(NamedTuple):
     range_m: float = nan  # as measured, with errors of scale and offset
     bearing_rad: float | None = None  # from the vehicle's heading, counter-clockwise; None without a direction
     rssi_dbm: float = nan
+    radio: Radio | None = None  # that heard it, of several; None: the only one, which is at the pose
 
 
 class BeaconEstimate(NamedTuple):

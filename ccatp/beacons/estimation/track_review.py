@@ -21,7 +21,7 @@ def range_residuals(run: RecordedRun, track: EstimatedPath, camera_field_rad: fl
     nowhere = np.full(2, np.nan)
     places = np.array([track.beacons[name][:2] if name in track.beacons else nowhere for name in run.beacon_ids])
     r = run.readings.with_distances(camera_field_rad)
-    at = np.column_stack([np.interp(r.times_s, track.times_s, track.poses[:, k]) for k in range(2)])
+    at = r.radios_at(track.poses_at(r.times_s))
     scale, offset_m = (track.calibration.get(name, _NONE).value for name in ("range_scale", "range_offset_m"))
     return np.asarray((r.range_m - offset_m) / (1.0 + scale) - np.hypot(*(places[r.beacon] - at).T))
 

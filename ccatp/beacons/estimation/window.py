@@ -7,6 +7,7 @@ relation to these.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from math import sqrt
 from typing import NamedTuple
 
@@ -85,7 +86,7 @@ class Window:
         self._marginal: MarginalPrior | None = None
         self._last: _Solved | None = None
         self._seen: tuple[object, ...] = (0, 0)
-        self.noise = BeaconNoise.configured(len(run.beacon_ids))
+        self.noise = BeaconNoise.configured(len(run.beacon_ids) * len(run.radios))
         self._places = None if run.known_map is None else PlacePrior.of_run(run, run.beacon_ids)
         self._configured, self._cfg = cfg.priors, cfg.model_copy(update={"priors": reweighted(cfg.priors, {})})
         self._due_s, self._placed = self._begin_s, frozenset[str]()
@@ -125,9 +126,9 @@ class Window:
         self._last = solved
         self._correct(slam, solved, time_s)
         self._reweight(solved)
-        self.noise = range_noise(solved.problem, solved.state)
-        for k, name in enumerate(self._run.beacon_ids):
-            slam.take_noise(name, *(float(column[k]) for column in (self.noise.variance, *self.noise[2:])))
+        self.noise = range_noise(solved.problem, solved.state, len(self._run.radios))
+        for k, (radio, name) in enumerate(product(self._run.radios, self._run.beacon_ids)):
+            slam.take_noise(name, radio, *(float(column[k]) for column in (self.noise.variance, *self.noise[2:])))
         self._hand_over(time_s - self._lag.lag_s)
         if time_s - self._begin_s > self._lag.window_s:
             self._marginalise(time_s - KEPT * self._lag.window_s)
@@ -155,7 +156,8 @@ class Window:
 
     def findings(self) -> Iterator[str]:
         """What was found of the noise, and what was done about it."""
-        names = [(name, k) for k, name in enumerate(self._run.beacon_ids) if self.noise.repeats[k] > REPORTED]
+        heard = product([f" by tag {tag.name}" for tag in self._run.tags] or [""], self._run.beacon_ids)
+        names = [(f"{name}{by}", k) for k, (by, name) in enumerate(heard) if self.noise.repeats[k] > REPORTED]
         for name, k in names:
             yield (
                 f"range errors of beacon {name} last for {self.noise.lasts_s[k]:.1f} s: {self.noise.repeats[k]:.0f} "

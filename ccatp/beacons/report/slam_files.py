@@ -17,13 +17,13 @@ from ccatp.core import FloatArray
 
 PATH = ("time_s", "x_m", "y_m", "heading_rad", "xx_m2", "xy_m2", "xh_m_rad", "yy_m2", "yh_m_rad", "hh_rad2")
 READINGS = (
-    "time_s", "beacon", "range_m", "bearing_rad", "rssi_dbm", "residual_m", "nis", "nis_size", "is_used",
+    "time_s", "beacon", "tag", "range_m", "bearing_rad", "rssi_dbm", "residual_m", "nis", "nis_size", "is_used",
 )  # fmt: skip
 FRAME = "of the first pose: that of the truth, or the origin"
 
 
 def write_slam(folder: Path, run: RecordedRun, track: EstimatedPath, assumed: RecordingConfig) -> None:
-    """Write ``path.csv``, ``map.toml`` with the joint covariance, ``readings.csv`` and ``graph.pyfg``.
+    """Write ``path.csv``, ``map.toml`` with the joint covariance, ``readings.csv`` and, for one radio, ``graph.pyfg``.
 
     A path of a fixed-lag smoother is in ``path_delayed.csv``, too. Raises RadioDataError: they cannot be written.
     """
@@ -33,10 +33,11 @@ def write_slam(folder: Path, run: RecordedRun, track: EstimatedPath, assumed: Re
         if (late := track.delayed) is not None:
             _write(folder / "path_delayed.csv", PATH, _path_rows(late.times_s, late.poses, late.covariances))
         _write(folder / "readings.csv", READINGS, _reading_rows(run, track, assumed.radio.camera_field_rad))
-        times_s = run.steps.times_s
-        true = np.full((len(times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, times_s)
-        graph = "\n".join(pyfg_lines(run, assumed, true)) + "\n"
-        (folder / "graph.pyfg").write_text(graph, encoding="utf-8")
+        if not run.tags:  # the format has no places of radios on the vehicle
+            times_s = run.steps.times_s
+            true = np.full((len(times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, times_s)
+            graph = "\n".join(pyfg_lines(run, assumed, true)) + "\n"
+            (folder / "graph.pyfg").write_text(graph, encoding="utf-8")
     except OSError as error:
         raise RadioDataError(error.filename or folder, f"cannot be written: {error.strerror or error}") from error
     places_m = np.array([fix[:2] for fix in track.beacons.values()], dtype=np.float64).reshape(-1, 2)
@@ -59,9 +60,11 @@ def _path_rows(times_s: FloatArray, poses: FloatArray, covariances: FloatArray) 
 def _reading_rows(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -> Iterable[list[object]]:
     """Residuals are those of the final path and map; innovations are those before each update. Empty: there is none."""
     residuals = range_residuals(run, track, camera_field_rad)
-    found = {(one.time_s, one.beacon): one for one in track.innovations}
-    for row, (time_s, beacon, *values) in enumerate(zip(*(column.tolist() for column in run.readings), strict=True)):
-        name = run.beacon_ids[beacon]
-        one = found.get((time_s, name))
-        numbers = ["" if np.isnan(value) else value for value in (*values, float(residuals[row]))]
-        yield [time_s, name, *numbers, *(("", "", "") if one is None else (one.nis, one.size, int(one.is_used)))]
+    found = {(one.time_s, one.beacon, one.tag): one for one in track.innovations}
+    r = run.readings
+    columns = (r.times_s, r.beacon, r.range_m, r.bearing_rad, r.rssi_dbm, residuals)
+    for row, (time_s, beacon, *values) in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+        name, tag = run.beacon_ids[beacon], "" if r.tag is None else run.tags[int(r.tag[row])].name
+        one = found.get((time_s, name, tag))
+        numbers = ["" if np.isnan(value) else value for value in values]
+        yield [time_s, name, tag, *numbers, *(("", "", "") if one is None else (one.nis, one.size, int(one.is_used)))]

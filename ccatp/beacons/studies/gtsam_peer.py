@@ -64,6 +64,8 @@ def run_gtsam(
     gtsam = import_gtsam()
     if not np.isfinite(run.readings.range_m).all():
         raise PeerGaveUp(f"{run.name}: not all readings have a range, and GTSAM has no factor of signal strengths")
+    if run.tags and np.isfinite(run.readings.bearing_rad).any():
+        raise PeerGaveUp(f"{run.name}: GTSAM has no factor of a bearing by one of several tags")
     try:
         return _Session(gtsam, run, settings).solve(clock_s, limit_s, progress)
     except RuntimeError as error:
@@ -210,7 +212,8 @@ class _Session:
 
     def _place(self, row: int, waiting: list[int]) -> tuple[float, float] | None:
         r = self._run.readings
-        poses = self._path[self._at[waiting]]
+        poses = self._path[self._at[waiting]].copy()
+        poses[:, :2] = r.where(np.array(waiting)).radios_at(poses)
         if np.isfinite(r.bearing_rad[row]):
             x, y, heading = poses[-1]
             way = heading + r.bearing_rad[row]
@@ -232,6 +235,8 @@ class _Session:
             noise = self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas))
             return gtsam.BearingRangeFactor2D(*keys, gtsam.Rot2(r.bearing_rad[row]), r.range_m[row], noise)
         noise = self._robust(gtsam.noiseModel.Isotropic.Sigma(1, sigma))
+        if r.arm_m is not None:
+            return gtsam.RangeFactorWithTransform2D(*keys, r.range_m[row], noise, gtsam.Pose2(*r.arm_m[row], 0.0))
         return gtsam.RangeFactor2D(*keys, r.range_m[row], noise)
 
     def _robust(self, noise: Any) -> Any:

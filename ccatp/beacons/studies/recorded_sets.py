@@ -125,16 +125,23 @@ def events_of(run: RecordedRun, begin_s: float, end_s: float) -> tuple[dict[str,
     steps, readings, known = run.steps, run.readings, np.isfinite
     moves = (np.concatenate([[0.0], column]) for column in (steps.distance_m, steps.turn_rad, steps.lateral_m))
     tables = {"odom": table(steps.times_s, *moves)}
-    for kind, column in zip(("range", "bearing", "rssi"), readings[2:], strict=True):
+    tag = np.full(len(readings.times_s), np.nan) if readings.tag is None else readings.tag.astype(np.float64)
+    for kind, column in zip(("range", "bearing", "rssi"), readings[2:5], strict=True):
         there = known(column)
         if there.any():
-            tables[kind] = table(readings.times_s[there], readings.beacon[there].astype(float), column[there])
+            tables[kind] = table(
+                readings.times_s[there], readings.beacon[there].astype(float), column[there], tag[there]
+            )
+    if run.tags:  # ranges are in the plane already
+        places = [(k, tag.ahead_m, tag.left_m, 0.0) for k, tag in enumerate(run.tags)]
+        tables["tag"] = Table(Path(run.name), np.array(places), np.arange(1, len(places) + 1))
     truth = None if run.truth is None else ReferencePath(*table(*run.truth).values.T)
     return tables, truth
 
 
 def read_again(run: RecordedRun, tables: Mapping[str, Table], truth: ReferencePath | None) -> RecordedRun:
     """A run from tables of events, as read and checked by the reader without the truth, which is added afterwards."""
-    again = checked_run(Recording(Path(run.name), run.name, run.kind, tables, run.beacon_ids))
+    tags = tuple(tag.name for tag in run.tags)
+    again = checked_run(Recording(Path(run.name), run.name, run.kind, tables, run.beacon_ids, tags=tags))
     pose = pose_of_truth(truth, again.steps, [])
     return replace(again, first_pose=pose, truth=truth, beacon_truth_m=run.beacon_truth_m)

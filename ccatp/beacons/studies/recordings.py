@@ -16,6 +16,7 @@ from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.cricket.measured_map import map_measured
 from ccatp.beacons.datasets.doubts import map_doubts, stray_beacons, sudden_disagreement, survey_doubts
+from ccatp.beacons.datasets.mounting import radio_doubts
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
 from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
 from ccatp.beacons.estimation.causal import filter_run
@@ -62,6 +63,7 @@ def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> E
     surveyed = survey_doubts(track, run.beacon_truth_m) if run.truth is None else []
     if run.known_map is not None:
         surveyed += map_doubts(track, run.known_map)
+    surveyed += radio_doubts(run, track)
     doubts = prediction_doubts(predicted(run, track, cfg.radio.camera_field_rad))
     return track._replace(
         warnings=(*track.warnings, *stray_beacons(run, track), *sudden_disagreement(track), *surveyed, *doubts)

@@ -11,6 +11,7 @@ from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.datasets.pyfg import pyfg_lines
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.tables import RadioDataError
+from ccatp.beacons.estimation.recording import Radio
 from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, world, write_lines
 
 W = world(seconds=20.0)
@@ -228,22 +229,76 @@ def test_times_since_1970_in_another_unit_are_recognised(factor: float, unit: st
     np.testing.assert_allclose(run.readings.times_s - since_s, W.read_s, atol=1e-3)
 
 
-def test_the_readings_of_one_tag_are_used_at_its_place(tmp_path: Path) -> None:
+def two_tags(tmp_path: Path) -> Path:
     long_form(tmp_path)
     rows: list[tuple[object, ...]] = [(t, 1 + k % 3 // 2, n, r) for k, (t, n, r) in enumerate(RANGES)]
-    file = write_lines(tmp_path / "uwb.csv", lines_of("time,tag_id,anchor,range", rows))
+    return write_lines(tmp_path / "uwb.csv", lines_of("time,tag_id,anchor,range", rows))
+
+
+TAGS = ["tag,forward,left,up", "1,0.4,0.1,0.3", "2,-0.4,-0.1,0.3"]
+
+
+def test_all_tags_with_a_place_are_used_each_at_its_own(tmp_path: Path) -> None:
+    file = two_tags(tmp_path)
+    write_lines(tmp_path / "tags.csv", TAGS)
+    run = read_run(file, None, None)
+    assert run.tags == (Radio("1", 0.4, 0.1), Radio("2", -0.4, -0.1))
+    assert run.readings.range_m.tolist() == [r for _, _, r in RANGES]
+    assert run.readings.tag is not None
+    assert run.readings.arm_m is not None
+    assert run.readings.tag.tolist() == [k % 3 // 2 for k in range(len(RANGES))]
+    assert run.readings.arm_m[:3].tolist() == [[0.4, 0.1], [0.4, 0.1], [-0.4, -0.1]]
+    assert run.antenna_m == (0.0, 0.0)
+    assert "not used" not in " | ".join(run.warnings)
+
+
+def test_the_readings_of_one_tag_are_used_at_its_place(tmp_path: Path) -> None:
+    file = two_tags(tmp_path)
     run = read_run(file, None, None)
     said = " | ".join(run.warnings)
     assert run.readings.range_m.tolist() == [r for k, (_, _, r) in enumerate(RANGES) if k % 3 < 2]
+    assert run.readings.arm_m is None
     assert f"readings of tag 1 ({len(run.readings.times_s)}) are used, those of the tags 2 (" in said
-    assert "the place of tag 1 is not known" in said
-    write_lines(tmp_path / "tags.csv", ["tag,forward,left,up", "1,0.4,0.1,0.3", "2,-0.4,-0.1,0.3"])
+    assert "the place of tag 1 is taken as zero: no place on the vehicle is given" in said
+    write_lines(tmp_path / "tags.csv", TAGS)
     other = read_run(file, None, None, tag="2")
     assert other.readings.range_m.tolist() == [r for k, (_, _, r) in enumerate(RANGES) if k % 3 == 2]
     assert other.antenna_m == (-0.4, -0.1)
-    assert "is not known" not in " | ".join(other.warnings)
-    with pytest.raises(RadioDataError, match="has no reading of tag 3; there are 1, 2"):
+    assert other.tags == ()
+    assert "is taken as" not in " | ".join(other.warnings)
+    with pytest.raises(RadioDataError, match=r"has no reading of tag 3; there are 1 \(\d+\), 2 "):
         read_run(file, None, None, tag="3")
+
+
+@pytest.mark.parametrize("place", ["2,,", "", "2,nan,nan"])
+def test_a_tag_without_a_place_is_named_and_left_out(place: str, tmp_path: Path) -> None:
+    file = two_tags(tmp_path)
+    write_lines(tmp_path / "tags.csv", [*TAGS[:2], *([place] if place else [])])
+    run = read_run(file, None, None)
+    assert run.readings.range_m.tolist() == [r for k, (_, _, r) in enumerate(RANGES) if k % 3 < 2]
+    assert run.antenna_m == (0.4, 0.1)
+    assert "readings of the tags 2 (33) are not used: no place on the vehicle is given" in " | ".join(run.warnings)
+
+
+def test_two_places_of_one_tag_and_too_many_tags_are_refused(tmp_path: Path) -> None:
+    file = two_tags(tmp_path)
+    write_lines(tmp_path / "tags.csv", [*TAGS, "1,0.5,0.1,0.3"])
+    with pytest.raises(RadioDataError, match=r"tags\.csv:4: tag 1 has two places"):
+        read_run(file, None, None)
+    rows: list[tuple[object, ...]] = [(t, k, n, r) for k, (t, n, r) in enumerate(RANGES)]
+    write_lines(file, lines_of("time,tag_id,anchor,range", rows))
+    with pytest.raises(RadioDataError, match="are these the names of tags"):
+        read_run(file, None, None)
+
+
+def test_tags_in_a_csv_of_events(tmp_path: Path) -> None:
+    lines = [f"{line},{'ab'[k // 2 % 2]}" if line.startswith("range") else line for k, line in enumerate(csv_lines(W))]
+    lines = [line for line in lines if not line.startswith("bearing")]
+    run = read_run(write_lines(tmp_path / "run.csv", [*lines, "tag,a,0.3,0.1", "tag,b,-0.3,0,0.2"]), None, None)
+    assert set(run.tags) == {Radio("a", 0.3, 0.1), Radio("b", -0.3, 0.0)}
+    assert len(run.readings.times_s) == W.read_s.size
+    with pytest.raises(RadioDataError, match="tag has no name of a tag"):
+        read_run(write_lines(tmp_path / "run.csv", [*lines, "tag,,0.3,0.1"]), None, None)
 
 
 def test_tags_and_beacons_that_are_exchanged_are_named(tmp_path: Path) -> None:
@@ -257,7 +312,7 @@ def test_tags_and_beacons_that_are_exchanged_are_named(tmp_path: Path) -> None:
     ("name", "lines", "what"),
     [
         ("uwb.csv", ["time,anchor,range", "1,A,2"], "has no column of tags, so none of tag 2"),
-        ("run.csv", ["odom,0,0,0"], "a csv set names no tags: leave out --tag"),
+        ("run.csv", ["odom,0,0,0", "range,0,A,1"], "has no column of tags, so none of tag 2"),
     ],
 )
 def test_a_tag_that_no_column_names_is_refused(name: str, lines: list[str], what: str, tmp_path: Path) -> None:

@@ -190,8 +190,8 @@ def test_weights_are_the_gradient_of_the_cost() -> None:
 def test_readings_that_share_their_error_are_counted() -> None:
     nothing = np.full(5, np.nan)
     readings = Readings(np.array([0.0, 0.4, 0.8, 5.0, 5.1]), np.array([0, 0, 0, 0, 1]), nothing, nothing, nothing)
-    assert repeats(readings, 1.0).tolist() == [2.0, 3.0, 2.0, 1.0, 1.0]
-    assert repeats(readings, 0.0).tolist() == [1.0] * 5
+    assert repeats(readings.times_s, readings.beacon, 1.0).tolist() == [2.0, 3.0, 2.0, 1.0, 1.0]
+    assert repeats(readings.times_s, readings.beacon, 0.0).tolist() == [1.0] * 5
 
 
 SETTINGS, HOW = load_recordings_config().csv, load_recordings_config().filter
