@@ -118,11 +118,11 @@ class Survey(EngagementRules[SurveyState]):
         out = s.points.causes
         if s.kind is Kind.OVER:
             # What held the robot when an operator stopped it is not why the mission ended.
-            is_stopped = s.outcome is SurveyOutcome.STOPPED
-            why, over = (
-                "stopped by an operator" if is_stopped else text_of(s.cause) or str(s.outcome),
-                {*s.points.done, *out},
-            )
+            why, over = text_of(s.cause) or str(s.outcome), {*s.points.done, *out}
+            if s.outcome is SurveyOutcome.STOPPED:
+                why = "stopped by an operator"
+            elif s.cause.condition == conditions.OPERATOR.name:
+                why = "aborted by an operator"
             out |= {point: why for point in self._points if point not in over}
         return out
 
