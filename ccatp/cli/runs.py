@@ -4,7 +4,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -122,11 +122,15 @@ def remove_runs(
         common.print_lines(f"{size / 1e6:10.1f} MB  {run_dir}" for run_dir, size in sizes.items())
         if not sys.stdin.isatty():
             raise ConfigError("nothing is removed: there is no terminal to ask; give --yes")
-        click.confirm(f"Remove {len(chosen)} runs, {total_mb:.1f} MB?", abort=True)
+        click.confirm(f"Remove {_count(chosen)}, {total_mb:.1f} MB?", abort=True)
     for run_dir in chosen:
         removal.remove(run_dir, force=force)
-    lines = [f"removed {len(chosen)} runs, {total_mb:.1f} MB" if chosen else "no run is removed"]
+    lines = [f"removed {_count(chosen)}, {total_mb:.1f} MB" if chosen else "no run is removed"]
     common.print_result({"removed": [str(run_dir) for run_dir in chosen], "mb": round(total_mb, 1)}, lines, json_output)
+
+
+def _count(chosen: Sequence[Path]) -> str:
+    return f"{len(chosen)} run{'s' * (len(chosen) != 1)}"
 
 
 def _facts(run_dir: Path) -> dict[str, Any]:
