@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from ccatp.beacons.config.models import RadioConfig
+from ccatp.beacons.onboard.hardware import BeaconAccess, BeaconHardware
 from ccatp.onboard.hardware import HardwareError
 from tests.faults.linking import Measured
 from tests.support.beacon_fakes import CYCLE_S
@@ -227,6 +228,27 @@ def test_a_loop_that_stood_longer_than_the_watchdog_is_held(measured: Measured) 
     assert robot.late_steps == 1
     driving.step()
     assert driving.goes_on
+
+
+@pytest.mark.fault("B41")
+def test_a_base_that_halted_resumes_nothing_when_the_program_is_started_again(measured: Measured) -> None:
+    driving = Driving()
+    time, device = driving.rig.time, driving.rig.base
+    while device.velocity:
+        time.sleep(STEP_S)
+        device.live()
+    moved, move = [0], device._move
+
+    def watched(velocity_m_s: float, turn_rad_s: float) -> tuple[float, float]:
+        moved[0] += bool(velocity_m_s or turn_rad_s)
+        return move(velocity_m_s, turn_rad_s)
+
+    device._move = watched
+    access = BeaconAccess(lambda name, _baud, _key: driving.rig.ports[name].open(), driving.rig.dish.open_lines,
+                          driving.rig.dish.open_input, time.sleep)  # fmt: skip
+    BeaconHardware(driving.rig.onboard, time, access).start()
+    measured("B41", moved[0], "cycles")
+    assert device.is_enabled
 
 
 @pytest.mark.fault("B21")

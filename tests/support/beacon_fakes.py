@@ -259,7 +259,8 @@ CYCLE_S = 0.1
 class FakePioneer(FakePort):
     """A Pioneer base: handshake, watchdog, packets of each cycle; ``move`` drives the wheels for a cycle.
 
-    ``move`` takes travel (m/s) and turn (rad/s), and gives those that the encoders measure. sonar_m: readings.
+    ``move`` takes travel (m/s) and turn (rad/s), and gives those that the encoders measure. sonar_m: readings. When
+    its watchdog expires it halts, and with the next packet it resumes its motion, as the manuals say.
     """
 
     def __init__(
@@ -284,10 +285,20 @@ class FakePioneer(FakePort):
 
     def power_on(self) -> None:
         self._host, self._stage = b"", 0
-        self.velocity, self.turn = 0.0, 0.0  # m/s, rad/s
+        self._set_points, self.is_halted = [0.0, 0.0], False  # m/s, rad/s
         self._has_encoders, self.counts = False, [0.0, 0.0]
         self._next_s = self._time.now_s + CYCLE_S
         self._heard_s = self._time.now_s
+
+    @property
+    def velocity(self) -> float:
+        """Of its motion, m/s."""
+        return 0.0 if self.is_halted else self._set_points[0]
+
+    @property
+    def turn(self) -> float:
+        """Of its motion, rad/s."""
+        return 0.0 if self.is_halted else self._set_points[1]
 
     def packet(self, body: bytes, after_s: float = 0.002) -> None:
         total = 0
@@ -304,7 +315,7 @@ class FakePioneer(FakePort):
             if len(self._host) < start + 3 + size:
                 return
             body, self._host = self._host[start + 3 : start + 1 + size], self._host[start + 3 + size :]
-            self._heard_s = self._time.now_s
+            self._heard_s, self.is_halted = self._time.now_s, False
             sign = -1 if len(body) > 1 and body[1] == 0x1B else 1
             self._obey(body[0], sign * int.from_bytes(body[2:4], "little") if len(body) >= 4 else None)
 
@@ -324,9 +335,11 @@ class FakePioneer(FakePort):
         elif command == 4:
             self.is_enabled = value == 1
         elif command == 11 and value is not None:
-            self.velocity = 1e-3 * value
+            self._set_points[0] = 1e-3 * value
         elif command == 21 and value is not None:
-            self.turn = value * pi / 180.0
+            self._set_points[1] = value * pi / 180.0
+        elif command == 29:
+            self._set_points = [0.0, 0.0]
         elif command == 19:
             self._has_encoders = bool(value)
 
@@ -336,7 +349,7 @@ class FakePioneer(FakePort):
             if self._stage < 3:
                 continue
             if at_s - self._heard_s > 1e-3 * self.watchdog_ms and (self.velocity or self.turn):
-                self.velocity = self.turn = 0.0
+                self.is_halted = True
                 self.expired += 1
             if self.stop_pressed:
                 self.is_enabled = False

@@ -15,7 +15,7 @@ _POSITIVE, _NEGATIVE = 0x3B, 0x1B  # types of a number in a command
 
 # Commands. OPEN has the number of SYNC1.
 SYNC0, SYNC1, SYNC2 = 0, 1, 2
-OPEN, CLOSE, ENABLE, SETA, VEL, CONFIG, ENCODER, RVEL, SETRA, SONAR = 1, 2, 4, 5, 11, 18, 19, 21, 23, 28
+OPEN, CLOSE, ENABLE, SETA, VEL, CONFIG, ENCODER, RVEL, SETRA, SONAR, STOP = 1, 2, 4, 5, 11, 18, 19, 21, 23, 28, 29
 CONFIG_PACKET, ENCODER_PACKET = 0x20, 0x90
 STANDARD_PACKETS = frozenset((0x32, 0x33))  # motors stopped, robot moving
 _STANDARD = struct.Struct("<HHhhhBBBhHBB")
@@ -58,6 +58,11 @@ def format_command(command: int, value: int | None = None) -> bytes:
         return format_packet(bytes([command]))
     kind = _NEGATIVE if value < 0 else _POSITIVE
     return format_packet(bytes([command, kind]) + abs(value).to_bytes(2, "little"))
+
+
+# Begins a handshake. A base whose watchdog has expired in a session that is still open resumes its last motion with the
+# next packet, whatever it is: so the first one is STOP.
+GREETING = format_command(STOP) + format_command(SYNC0)
 
 
 class PacketReader(FrameFinder):

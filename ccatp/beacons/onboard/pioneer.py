@@ -1,7 +1,8 @@
 """The Pioneer base: handshake, speeds, odometry, sonars, battery, stall, bumpers, and its own watchdog.
 
-The base stops its wheels when it has received no command for the time of its watchdog, which is a parameter in its
-flash memory: the program reads it and refuses a base that waits longer than the configuration allows. Speeds are sent
+The base halts its wheels when it has received no command for the time of its watchdog, which is a parameter in its
+flash memory: the program reads it and refuses a base that waits longer than the configuration allows. With the next
+command the base resumes its last motion, so the program begins each handshake with ``STOP``. Speeds are sent
 as travel (mm/s) and turn (degrees/s), which are finer than ``VEL2`` (20 mm/s); what rounding leaves over is added to
 the next command.
 """
@@ -15,6 +16,7 @@ from ccatp.beacons.links.arcos_packets import (
     CONFIG,
     ENABLE,
     ENCODER,
+    GREETING,
     OPEN,
     RVEL,
     SETA,
@@ -47,7 +49,8 @@ _DISAGREES = 0.5  # of the base's own speed, by which the encoders may differ fr
 _FAST_MM_S = 60.0  # speeds above are compared
 _CONTINUOUS = 2
 _IMPOSSIBLE = 3.0  # times the highest set point: no wheel turns so fast, a count was damaged
-_JUMPS, _JUMPS_S = 3, 10.0  # so many within this time are a fault; a damaged count gives two, there and back
+_JUMPS, _JUMPS_S = 3, 10.0  # so many within this time are a fault
+_NEAREST_S = 0.05  # between two counts: those that were delayed on their way arrive together
 
 WheelSpeeds = tuple[float, float | None, float | None]  # time; mean speed of the right and left wheel since the last
 
@@ -73,8 +76,10 @@ class PioneerBase(BeaconDevice):
         self._jumps_s: deque[float] = deque(maxlen=_JUMPS)
         self.reader = PacketReader()
         self._stage = SYNC0
+        self._settings: deque[tuple[int, int]] = deque()  # commands that are not sent yet
         self._ask_s = self._enable_s = self._standard_s = self._counts_s = -inf
-        self._last: tuple[int, int] | None = None
+        self._last: tuple[int, int] | None = None  # counts at the newest sample of the wheels,
+        self._last_s = -inf  # and their time
         self._new_counts: tuple[int, int] | None = None
         self._samples: list[WheelSpeeds] = []
         self._rates = 0.0, 0.0  # newest, right and left
@@ -89,7 +94,8 @@ class PioneerBase(BeaconDevice):
     @property
     def is_ready(self) -> bool:
         """It sends its packets, and its watchdog is short enough."""
-        return self._line.is_open and self._stage == _RUNS and self._counts_s > -inf and self._standard_s > -inf
+        has_begun = self._stage == _RUNS and not self._settings
+        return self._line.is_open and has_begun and self._counts_s > -inf and self._standard_s > -inf
 
     # -- in time ------------------------------------------------------------------------------------------------------
 
@@ -102,6 +108,7 @@ class PioneerBase(BeaconDevice):
         self._stage, self._ask_s, self._last = SYNC0, now_s, None
         self._standard_s = self._counts_s = -inf
         self._ranges = {}
+        self._settings.clear()
 
     def _stop(self) -> None:
         stage, self._stage = self._stage, SYNC0
@@ -118,9 +125,12 @@ class PioneerBase(BeaconDevice):
             self._new_counts = None
         if self._stage < _RUNS and now_s >= self._ask_s:
             self._ask_s = now_s + ASK_S
-            self._line.write(format_command(self._stage) if self._stage <= SYNC2 else format_command(CONFIG))
+            question = CONFIG if self._stage == _CONFIGURES else self._stage
+            self._line.write(GREETING if self._stage == SYNC0 else format_command(question))
         elif self._stage == _RUNS and now_s - self._line.valid_s > CLOSED_S:
             self._restart(now_s)  # it was switched off, or restarted
+        elif self._settings:  # one in each step: the base may lose commands that follow each other within 5 ms
+            self._line.write(format_command(*self._settings.popleft()))
 
     def _take_packet(self, packet: bytes, now_s: float) -> None:
         kind, config = packet[0], self._config
@@ -144,11 +154,10 @@ class PioneerBase(BeaconDevice):
             self._identity += f", watchdog {watchdog_s:g} s"
             acceleration = round(1e3 * config.acceleration_m_s2)
             turn = round(config.turn_acceleration_rad_s2 / _DEGREE_RAD)
-            for command, value in (
+            self._settings += (
                 (SETA, acceleration), (SETA, -acceleration), (SETRA, turn), (SETRA, -turn),
                 (SONAR, 1), (ENCODER, _CONTINUOUS), (ENABLE, 1),
-            ):  # fmt: skip
-                self._line.write(format_command(command, value))
+            )  # fmt: skip
             self._stage, self._enable_s = _RUNS, now_s + _ENABLE_S
         elif (standard := parse_standard(packet)) is not None:
             self._take_standard(standard, now_s)
@@ -180,20 +189,27 @@ class PioneerBase(BeaconDevice):
                 self._doubts = min(self._doubts + 1, 40) if is_off else 0
 
     def _take_counts(self, counts: tuple[int, int], now_s: float) -> None:
-        last, last_s = self._last, self._counts_s
-        self._last, self._counts_s = counts, now_s
+        """The mean speeds since the newest sample; counts that give none are left to the next one: no way is lost."""
+        self._counts_s = now_s
         self._line.recover()
-        if last is None or now_s - last_s > self._config.timeout_s:
-            return  # a gap: the speeds within it are not known
-        per_rad = 1e3 * self._radius_m * self._config.counts_per_mm
-        left, right = (wrapped_change(now, before) for now, before in zip(counts, last, strict=True))
-        rates = right / per_rad / (now_s - last_s), left / per_rad / (now_s - last_s)
-        if max(map(abs, rates)) > self._impossible_rad_s:
-            self._jumps_s.append(now_s)
+        if self._last is None:
+            self._last, self._last_s = counts, now_s
             return
-        self._rates = rates
-        self._samples.append((now_s, *self._rates))
-        self._compare()
+        interval_s = now_s - self._last_s
+        if interval_s < _NEAREST_S:
+            return
+        per_rad_s = 1e3 * self._radius_m * self._config.counts_per_mm * interval_s
+        left, right = (wrapped_change(now, before) / per_rad_s for now, before in zip(counts, self._last, strict=True))
+        is_possible = max(abs(left), abs(right)) <= self._impossible_rad_s
+        if not is_possible:
+            self._jumps_s.append(now_s)
+            if interval_s <= self._config.timeout_s:
+                return
+        self._last, self._last_s = counts, now_s
+        if is_possible:
+            self._rates = right, left
+            self._samples.append((now_s, right, left))
+            self._compare()
 
     # -- the robot ----------------------------------------------------------------------------------------------------
 
@@ -205,7 +221,7 @@ class PioneerBase(BeaconDevice):
     def drive(self, right_rad_s: float, left_rad_s: float, now_s: float) -> None:
         """Set the speeds of the wheels; each command also restarts the base's watchdog. Raises HardwareError."""
         set_points = right_rad_s, left_rad_s
-        if self._stage != _RUNS or (set_points == self._set_points and now_s - self._sent_s < SEND_S):
+        if self._stage != _RUNS or self._settings or (set_points == self._set_points and now_s - self._sent_s < SEND_S):
             return
         self._set_points, self._sent_s = set_points, now_s
         wanted = (

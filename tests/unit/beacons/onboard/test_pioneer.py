@@ -1,6 +1,7 @@
 """The Pioneer base: handshake, speeds, odometry, sonars, its watchdog, and what breaks."""
 
 import itertools
+import random
 from collections.abc import Callable
 from math import inf, radians
 
@@ -112,6 +113,44 @@ def test_the_watchdog_of_the_base_is_the_second_barrier(rig: Rig) -> None:
     assert rig.time.now_s - moving_s <= 0.5 + 0.1 + 0.05  # watchdog, a cycle, the last command's age
 
 
+def test_settings_are_sent_one_in_each_step_and_before_any_speed() -> None:
+    rig, written = Rig(), list[tuple[float, bytes]]()
+    take = rig.device.take
+
+    def taken(data: bytes) -> None:
+        written.append((rig.time.now_s, data))
+        take(data)
+
+    rig.device.take = taken  # type: ignore[method-assign]
+    rig.open().run(0.5, 1.0, 1.0)
+    numbers = [[part[1] for part in data.split(b"\xfa\xfb")[1:]] for _, data in written]
+    first = numbers.index([5])
+    assert numbers[first : first + 8] == [[5], [5], [23], [23], [28], [19], [4], [11, 21]]
+    times_s = [at_s for at_s, _ in written[first : first + 8]]
+    assert min(later - before for before, later in itertools.pairwise(times_s)) >= 0.005 - 1e-9
+
+
+@pytest.mark.parametrize("is_opened_again", [False, True], ids=["the cable was pulled", "the program was killed"])
+def test_a_base_that_halted_does_not_resume_its_motion_when_it_is_reached_again(is_opened_again: bool) -> None:
+    rig = Rig().open()
+    rig.run(1.0, 2.0, 1.0)
+    if not is_opened_again:
+        rig.device.unplug()
+        rig.base.poll(rig.time.now_s)
+    while rig.device.velocity:
+        rig.time.sleep(0.01)
+        rig.device.live()
+    rig.driven.clear()
+    rig.device.plug()
+    if is_opened_again:
+        rig.base = rig.driver(load_beacon_onboard_config(None, {}))
+        rig.base.open()
+    rig.run(5.0)
+    assert rig.base.is_ready
+    assert rig.driven
+    assert set(rig.driven) == {(0.0, 0.0)}
+
+
 def test_a_base_that_waits_too_long_is_refused() -> None:
     rig = Rig()
     rig.device.watchdog_ms = 2000
@@ -205,6 +244,27 @@ def test_encoders_that_contradict_the_base_are_a_fault() -> None:
     rig = Rig(counts_per_mm=12.8).open()
     rig.run(3.0, 2.0, 2.0)
     assert rig.base.fault(rig.time.now_s).startswith("the encoders show impossible speeds; check their cables")
+
+
+@pytest.mark.parametrize("longest_s", [0.09, 0.3, 1.0])
+def test_no_way_is_lost_when_packets_are_late_and_arrive_together(rig: Rig, longest_s: float) -> None:
+    rng, send = random.Random(3), rig.device.packet
+
+    def late(body: bytes, after_s: float = 0.0) -> None:
+        send(body, after_s + rng.uniform(0.0, longest_s))
+
+    rig.device.packet = late  # type: ignore[method-assign]
+    begun_s, begun = rig.time.now_s, list(rig.device.counts)
+    for right, left in ((3.0, 2.0), (0.5, 3.5), (0.0, 0.0), (-2.0, 2.0), (0.0, 0.0)):
+        rig.run(8.0, right, left)
+    del rig.device.packet
+    rig.run(2.0, 0.0)
+    times_s = [begun_s, *(sample[0] for sample in rig.samples)]
+    for side, number in ((1, 1), (2, 0)):
+        shown_rad = sum((sample[side] or 0.0) * (sample[0] - before_s)
+                        for sample, before_s in zip(rig.samples, times_s[:-1], strict=True))  # fmt: skip
+        true_rad = (rig.device.counts[number] - begun[number]) / (1e3 * RADIUS_M * rig.device.counts_per_mm)
+        assert shown_rad == pytest.approx(true_rad, abs=0.002)
 
 
 def test_packets_that_come_at_once_after_a_stall_of_the_program_contradict_nothing(rig: Rig) -> None:
