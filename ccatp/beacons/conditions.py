@@ -52,4 +52,15 @@ MISSION_TOO_LONG = fault("mission_too_long", Owner.MISSION, ALONE, GROUP,
     "the mission takes longer than mission.time_limit_s = {limit_s:g}",
     "The robot is held where it is.", "`ccatp abort` sends it home; or configure a longer time.",
     then="abort, or configure a longer time")
+TARGET_LOST = fault("target_lost", Owner.MISSION, ALONE, GROUP,
+    "the followed radio {name} was not received for {lost_s:g} s",
+    "The robot stands without it. Only time in which it is received counts as followed. The limit is "
+    "`follow.lost_after_s` and `danger.hold_limit_s` together.",
+    "Check its supply and its name (`follow.target`); `ccatp resume` waits for it again.",
+    then="check the supply and the name of the radio")
+MAP_STALLED = fault("map_stalled", Owner.MISSION, ALONE, GROUP,
+    "the motes do not map themselves: {lacking}, and no further one for {stalled_s:g} s",
+    "No range arrives that the map of the motes could use. The robot stands until there is a map. The limit is "
+    "`danger.hold_limit_s`.", "Check the named motes: their supply, their names, and what is between them.",
+    then="check the named motes")
 # fmt: on

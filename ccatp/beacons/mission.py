@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from ccatp.beacons.conditions import MISSION_TOO_LONG
+from ccatp.beacons.conditions import MAP_STALLED, MISSION_TOO_LONG, TARGET_LOST
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.modes import FOLLOWING, MAPPING, VISITING, BeaconMode, Deciding, Returning, Working
 from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
-from ccatp.beacons.pilot import BeaconPilot
+from ccatp.beacons.pilot import BeaconPilot, FollowState
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.conditions import Action
 from ccatp.core import NO_CAUSE, Verdict
@@ -97,7 +97,8 @@ class BeaconMission(EngagedMission[Engagement]):
         self._homing: BeaconPilot | None = None
         self.arrivals: list[WaypointArrival] = []
         self._begun_s: float | None = None
-        self._followed_s = 0.0
+        self._followed_s = self._lost_s = 0.0  # the second: since the followed radio was lost, or the mission began
+        self._map_readings, self._stalled_s = 0, 0.0  # of the self-mapping, and the time since the last useful one
         self._is_following = cfg.follow.is_active
 
     def _work(self, task: BeaconMode) -> None:
@@ -147,7 +148,7 @@ class BeaconMission(EngagedMission[Engagement]):
             if self.state.abort_cause:
                 self.finish(SurveyOutcome.AT_BASE)  # it never left
             else:
-                self._work(MAPPING)
+                self._map(interval_s)
             return HALT
         t_s, avoidance = measurements.t_s, self._cfg.avoidance
         # A frame without readings counts as free space; the pilot remembers earlier obstacles.
@@ -159,11 +160,33 @@ class BeaconMission(EngagedMission[Engagement]):
         if not self._is_following:
             self._visit()
         else:
-            self._work(FOLLOWING)
+            self._follow(interval_s)
+        return HALT if self.state.outcome is not SurveyOutcome.NONE else drive
+
+    def _map(self, interval_s: float) -> None:
+        """Wait for the map of the motes, as long as readings for it arrive."""
+        self._work(MAPPING)
+        readings = self.navigator.map_readings
+        self._stalled_s = 0.0 if readings != self._map_readings else self._stalled_s + interval_s
+        self._map_readings = readings
+        if self._stalled_s > self._cfg.danger.hold_limit_s:
+            cause = MAP_STALLED.cause(lacking=self.navigator.map_lacks, stalled_s=round(self._stalled_s))
+            self._state, self._stalled_s = RULES.meet(self.state, cause), 0.0
+
+    def _follow(self, interval_s: float) -> None:
+        """Count the time in which the radio is received; without it the robot has nothing to follow."""
+        self._work(FOLLOWING)
+        if self.pilot.follower.state is not FollowState.LOST:
+            self._lost_s = 0.0
             self._followed_s += interval_s
             if self._followed_s >= self._cfg.mission.follow_s:
                 self.finish(SurveyOutcome.COMPLETE)
-        return HALT if self.state.outcome is not SurveyOutcome.NONE else drive
+            return
+        self._lost_s += interval_s
+        cfg = self._cfg
+        if self._lost_s > cfg.follow.lost_after_s + cfg.danger.hold_limit_s:
+            cause = TARGET_LOST.cause(name=cfg.follow.target, lost_s=round(self._lost_s))
+            self._state, self._lost_s = RULES.meet(self.state, cause), 0.0
 
     def _visit(self) -> None:
         self._work(VISITING)

@@ -1,5 +1,6 @@
 """Localization of a robot: by radios, mapped while it drives, or by ultrasonic motes, which map themselves first."""
 
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from math import hypot
 from typing import NamedTuple
@@ -12,7 +13,7 @@ from ccatp.beacons.cricket.mote_plan import network_plan
 from ccatp.beacons.cricket.range_network import build_network, pair_range
 from ccatp.beacons.cricket.self_mapping import MoteMapper, begin_phase_two
 from ccatp.beacons.cricket.trilateration import map_by_plan
-from ccatp.beacons.estimation.motion import POSE, Increment, Odometry, SlippingVehicle, Steering
+from ccatp.beacons.estimation.motion import POSE, DeadReckoning, Increment, Odometry, SlippingVehicle, Steering
 from ccatp.beacons.estimation.recording import Reading
 from ccatp.beacons.estimation.signal_slam import ReflectorScan, SignalSlam
 from ccatp.beacons.filters.ekf_slam import EkfSlam, columns_of
@@ -28,6 +29,7 @@ class SelfMap:
 
     Phase 1 runs when every pair of its plan has the configured number of readings. Phase 2 then processes each later
     reading (Patil et al., figure 8). ``notes``: expected error after each phase, m; number of updates of phase 2.
+    ``readings``: number of those that were of use.
     """
 
     def __init__(self, cfg: CricketConfig) -> None:
@@ -42,6 +44,18 @@ class SelfMap:
         self._temperatures: dict[frozenset[int], list[float]] = {}
         self._mapper: MoteMapper | None = None
         self.notes: dict[str, float] = {}
+        self.readings = 0
+
+    @property
+    def lacking(self) -> str:
+        """What the map needs most, for messages."""
+        if self._mapper is not None:
+            expected_m, target_m = self._mapper.expected_rms_m, self._cfg.phase2.target_rms_m
+            return f"phase 2 expects an error of {expected_m:.3f} m, not yet {target_m:g} m"
+        counts = {pair: len(self._delays.get(pair, ())) for pair in self._wanted}
+        pair = min(counts, key=lambda pair: (counts[pair], sorted(pair)))
+        first, second = (self._plan.names[mote] for mote in sorted(pair))
+        return f"{first} and {second} have {counts[pair]} of {self._cfg.ranging.repeats} readings of each other"
 
     @property
     def is_done(self) -> bool:
@@ -68,6 +82,7 @@ class SelfMap:
         if self._mapper is not None:
             self._refine(self._mapper, pair, burst)
         elif pair in self._wanted:
+            self.readings += len(burst.delays_s)
             self._delays.setdefault(pair, []).extend(burst.delays_s)
             self._temperatures.setdefault(pair, []).extend([burst.temperature_c] * len(burst.delays_s))
             repeats = self._cfg.ranging.repeats
@@ -95,6 +110,7 @@ class SelfMap:
             reading = pair_range(self._cfg, (burst.sender, burst.listener), [delay_s], burst.temperature_c)
             mapper.observe(self._row_of[i], self._row_of[j], reading.range_m, reading.sigma_m)
             self.notes["map_updates"] += 1.0
+            self.readings += 1
         self.notes["map_expected_m"] = mapper.expected_rms_m
 
 
@@ -189,11 +205,17 @@ def ellipse_of(mean: FloatArray | Sequence[float], covariance: FloatArray) -> El
     return (float(mean[0]), float(mean[1]), float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]))
 
 
-class _DeadReckoning:
-    """The position by odometry alone, and the consistency of the readings."""
+class _VehicleNavigator:
+    """The position by odometry alone, the pose at the time of the frame, and the consistency of the readings.
+
+    Wheels and receivers have sample times of their own: a base sends its counts ten times a second, and they are up to
+    0.1 s older than the frame. Between the newest sample and the time of a reading, or of the frame, the vehicle is
+    assumed to keep its speed, for one interval of its odometry at most.
+    """
 
     def __init__(self, cfg: RadioConfig) -> None:
         self._cfg, self._motion = cfg, SlippingVehicle(cfg.vehicle, cfg.odometry)
+        self._clock, self._t_s = DeadReckoning(is_delayed=False), 0.0
         self._reckoned = np.zeros(self._motion.size)
         self._reckoned[:POSE] = cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad
         self.score = Score(0.0, 0, 0, 0)
@@ -205,16 +227,21 @@ class _DeadReckoning:
         else:
             self.score = Score(nis_sum, nis_size, used, refused + 1)
 
+    def _belief(self, pose: Sequence[float], covariance: FloatArray) -> PoseBelief:
+        """At the time of the frame, from that of the newest odometry."""
+        x_m, y_m, heading_rad = self._clock.at(list(pose), self._t_s, 0.0).pose
+        return PoseBelief((x_m, y_m, heading_rad), covariance)
+
     @property
     def reckoned_m(self) -> tuple[float, float]:
         """Position by odometry alone."""
         return float(self._reckoned[0]), float(self._reckoned[1])
 
 
-class RadioNavigator(_DeadReckoning):
+class RadioNavigator(_VehicleNavigator):
     """EKF-SLAM with levels and bearings of radios, which are mapped while the robot drives."""
 
-    is_mapping = False  # the map grows while the robot drives
+    is_mapping, map_readings, map_lacks = False, 0, ""  # the map grows while the robot drives
 
     def __init__(self, cfg: RadioConfig) -> None:
         super().__init__(cfg)
@@ -225,7 +252,7 @@ class RadioNavigator(_DeadReckoning):
     @property
     def belief(self) -> PoseBelief:
         """Of the robot."""
-        return PoseBelief(self.slam.pose, self.slam.pose_covariance)
+        return self._belief(self.slam.pose, self.slam.pose_covariance)
 
     @property
     def beacons(self) -> Mapping[str, Ellipse]:
@@ -249,9 +276,12 @@ class RadioNavigator(_DeadReckoning):
     def take(self, measurements: BeaconMeasurements) -> None:
         """Predict over the odometry intervals, then update with the readings of the frame."""
         for odometry in measurements.wheels:
+            before = np.array(self.slam.pose)
             self.slam.predict(odometry)
+            self._clock.took(odometry, before, np.array(self.slam.pose))
             self._reckoned = self._motion.step(self._reckoned, odometry).mean
         t_s, extras = measurements.t_s, measurements.extras
+        self._t_s = t_s
         readings = [] if extras.scan is None else self._scan.results(t_s, packets_of(extras.scan))
         readings += [
             Reading(t_s, one.beacon, bearing_rad=one.bearing_rad, rssi_dbm=one.rssi_dbm) for one in extras.radio
@@ -266,7 +296,7 @@ _PLACE = 2
 _NEAREST_M = 0.02  # lower limit of a distance, below which a range has no direction
 
 
-class MoteNavigator(_DeadReckoning):
+class MoteNavigator(_VehicleNavigator):
     """An EKF over the robot and all motes of the map.
 
     State: pose and calibration of the vehicle, then the motes. The map is added with the joint covariance of its
@@ -291,10 +321,19 @@ class MoteNavigator(_DeadReckoning):
         return not self._place_of
 
     @property
+    def map_readings(self) -> int:
+        """Readings between motes that the map could use so far."""
+        return self._self_map.readings
+
+    @property
+    def map_lacks(self) -> str:
+        """What the map needs most, for messages."""
+        return self._self_map.lacking
+
+    @property
     def belief(self) -> PoseBelief:
         """Of the robot."""
-        x_m, y_m, heading_rad = self._filter.mean[:POSE].tolist()
-        return PoseBelief((x_m, y_m, heading_rad), self._filter.covariance[:POSE, :POSE].copy())
+        return self._belief(self._filter.mean[:POSE].tolist(), self._filter.covariance[:POSE, :POSE].copy())
 
     @property
     def beacons(self) -> Mapping[str, Ellipse]:
@@ -319,20 +358,22 @@ class MoteNavigator(_DeadReckoning):
         return None
 
     def take(self, measurements: BeaconMeasurements) -> None:
-        """Predict over the odometry intervals, then update with the readings of the frame.
+        """Predict over the odometry intervals, and update with each reading of the frame at its own time.
 
         Raises MappingError: the motes cannot be mapped. Raises TdoaError: an impossible delay or temperature.
         """
-        state = self._filter
+        state, bursts = self._filter, deque(measurements.extras.motes)
         for odometry in measurements.wheels:
-            step = self._motion.step(state.mean[: state.vehicle_size], odometry)
+            before = state.mean[: state.vehicle_size].copy()
+            step = self._motion.step(before, odometry)
             state.predict(step.mean, step.F, step.Q)
+            self._clock.took(odometry, before, step.mean)
             self._reckoned = self._motion.step(self._reckoned, odometry).mean
-        for burst in measurements.extras.motes:
-            if burst.listener == self._cfg.listener.name:
-                self._range(burst)
-            elif self.is_mapping:
-                self._self_map.take(burst)
+            while bursts and bursts[0].t_s <= odometry.time_s:
+                self._take_burst(bursts.popleft())
+        for burst in bursts:
+            self._take_burst(burst)
+        self._t_s = measurements.t_s
         if self.is_mapping and self._self_map.is_done and self._self_map.places is not None:
             positions_m, covariance_m2 = self._self_map.places
             none, size = np.empty(0, dtype=np.intp), positions_m.size  # no correlation with the robot yet
@@ -341,16 +382,24 @@ class MoteNavigator(_DeadReckoning):
             self._place_of = {name: start + _PLACE * row for row, name in enumerate(self._self_map.names)}
             self._self_map.notes["map_time_s"] = measurements.t_s
 
+    def _take_burst(self, burst: MoteBurst) -> None:
+        if burst.listener == self._cfg.listener.name:
+            self._range(burst)
+        elif self.is_mapping:
+            self._self_map.take(burst)
+
     def _range(self, burst: MoteBurst) -> None:
         at = self._place_of.get(burst.sender)
         if at is None or not burst.delays_s:
             return
         reading = pair_range(self._cfg.cricket, (burst.sender, burst.listener), burst.delays_s, burst.temperature_c)
-        columns = columns_of(range(_PLACE), range(at, at + _PLACE))
-        x, y, mx, my = self._filter.mean.take(columns).tolist()
+        columns = columns_of(range(POSE), range(at, at + _PLACE))
+        *pose, mx, my = self._filter.mean.take(columns).tolist()
+        then = self._clock.at(pose, burst.t_s, 0.0)
+        x, y, _ = then.pose
         r = max(hypot(x - mx, y - my), _NEAREST_M)
         ux, uy = (x - mx) / r, (y - my) / r
-        h = np.array((ux, uy, -ux, -uy))
+        h = np.array((*then.derivatives(ux, uy, 0.0, delayed=False), -ux, -uy))
         found = self._filter.update_row(columns, h, reading.range_m - r, reading.sigma_m**2, self._gate)
         self._count(found.nis, 1, accepted=found.accepted)
 

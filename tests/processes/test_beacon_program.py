@@ -120,12 +120,16 @@ def program(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
 
 
 # Mean of 10 or 20 seeds of the simulated robot, and three standard deviations of a seed; in cricket also 0.1 s at
-# 0.3 m/s: a base sends its counts ten times a second, so the pose of a frame is that of the frame before.
+# 0.3 m/s, if this computer is busy: a late process of fake devices is a late clock.
 RMS_M = {"zigbee": 0.073 + 3 * 0.030, "follow": 0.068 + 3 * 0.032, "cricket": 0.005 + 3 * 0.001 + 0.03}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("system", "world"), [("zigbee", {}), ("follow", SLOWER), ("cricket", {})])
+@pytest.mark.parametrize(
+    ("system", "world"),
+    # Real motes never end to send; those of the world begin when it begins, before the robot listens.
+    [("zigbee", {}), ("follow", SLOWER), ("cricket", {"listener__mapping_rounds": 500})],
+)
 def test_missions_of_the_installed_program_over_serial_lines(
     tmp_path: Path, runtime_dir: Path, system: str, world: dict[str, Any]
 ) -> None:

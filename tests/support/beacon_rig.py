@@ -43,7 +43,7 @@ def onboard_config(cfg: RadioConfig, **overrides: Any) -> BeaconOnboardConfig:
         "robot.wheel_radius_m": cfg.robot.wheel_radius_m,
         "robot.track_m": cfg.vehicle.track_m,
         "robot.axle_distance_m": cfg.vehicle.wheelbase_m,
-        "robot.loop_hz": 20.0 if is_cricket else 100.0,
+        "robot.loop_hz": 100.0,
         "devices.base.sonars": [7, 6, 5, 4, 3, 2, 1, 0, *REAR_SONARS][: len(angles)],
         "devices.base.sonars_rad": angles,
         "devices.radio.names": names,

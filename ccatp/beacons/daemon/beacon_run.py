@@ -14,8 +14,16 @@ PROCESSES = tuple(replace(spec, is_replaceable=spec.is_replaceable and spec.name
 
 
 def check_beacons(options: RunOptions, cfg: RadioConfig) -> None:
-    """Raises ``ConfigError`` if the simulated robot has no radio to follow: it would stand until the mission ends."""
-    if options.sim and cfg.follow.is_active and cfg.sim.target.motion == "none":
+    """Raises ``ConfigError`` if the simulated robot would only stand: no radio to follow, or too few rounds to map."""
+    if not options.sim:
+        return
+    rounds, repeats = cfg.listener.mapping_rounds, cfg.cricket.ranging.repeats
+    if cfg.system == "cricket" and 2 * rounds <= repeats:  # each of a pair sends once in a round
+        raise ConfigError(
+            f"listener.mapping_rounds = {rounds}: the map needs cricket.ranging.repeats = {repeats} readings of each "
+            f"pair of motes, and more for phase 2; give {repeats} or more"
+        )
+    if cfg.follow.is_active and cfg.sim.target.motion == "none":
         raise ConfigError(
             'sim.target.motion = "none": there is no radio that the simulated robot could follow; give "random" or '
             '"waypoints"'

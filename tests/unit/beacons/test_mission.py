@@ -1,7 +1,7 @@
 """An operator's commands to a mission among beacons, and what it does without verdicts."""
 
 import sqlite3
-from math import hypot, inf, pi, radians
+from math import cos, hypot, inf, pi, radians, sin
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from ccatp.beacons.conditions import RADIO_SILENT
 from ccatp.beacons.config.models import RadioConfig
-from ccatp.beacons.estimation.motion import Steering
+from ccatp.beacons.estimation.motion import Increment, Steering
 from ccatp.beacons.links.messages import (
     BeaconFrame,
     MoteBurst,
@@ -397,6 +397,70 @@ def test_no_motion_towards_a_target_that_comes_faster_than_the_robot_backs() -> 
     assert distances.min() < cfg.danger.target_m
     assert "target" in found.summary["danger"]
     assert (speeds[distances < 0.9 * cfg.danger.target_m] <= 0.0).all()
+
+
+def silent_target(**when: float) -> RadioConfig:
+    incident = {"type": "radio_loss", "beacons": ["target"], **when}
+    return radio_config_of("follow", mission__follow_s=30.0, sim__incidents=[incident])
+
+
+def test_a_mission_whose_radio_is_never_received_is_not_complete() -> None:
+    found = play(BeaconSilWorld(silent_target(at_s=0.0, for_s=1e4))).result()
+    assert (found.outcome, found.states[-1]) == ("", "held")
+    assert found.cause == "the followed radio target was not received for 40 s"
+    assert found.times_s[-1] < 41.0
+
+
+def test_only_time_in_which_the_radio_is_received_counts_as_followed() -> None:
+    stage = BeaconSilWorld(silent_target(at_s=10.0, for_s=25.0))
+    play(stage, until_s=34.0)
+    assert stage.mission.done == pytest.approx(20, abs=1)  # the radio counts as lost 10 s after its last reading
+    assert play(stage).result().outcome == "complete"
+    assert stage.robot.t_s == pytest.approx(45.0, abs=1.0)
+
+
+def test_a_map_that_gets_no_further_readings_is_a_fault_that_names_a_pair() -> None:
+    found = play(BeaconSilWorld(radio_config_of("cricket", listener__mapping_rounds=20))).result()
+    assert found.states[-1] == "held"
+    assert found.cause == (
+        "the motes do not map themselves: A and B have 40 of 60 readings of each other, and no further one for 30 s"
+    )
+    found = play(BeaconSilWorld(radio_config_of("cricket", listener__mapping_rounds=30))).result()
+    assert "phase 2 expects an error of 0.1" in found.cause
+
+
+@pytest.mark.parametrize("system", ["cricket", "zigbee"])
+def test_samples_of_wheels_and_motes_count_at_their_own_times(system: str) -> None:
+    """The wheels are sampled 0.07 s before the frame, a mote 0.03 s before it; the robot drives at 0.3 m/s."""
+    stage = BeaconSilWorld(radio_config_of(system, vehicle__kind="differential"))
+    navigator = stage.mission.navigator
+    while navigator.is_mapping:
+        stage.frame()
+    begun_s, speed, rate = stage.robot.t_s, 0.3, 0.2
+    x_m, y_m, heading = navigator.belief.pose
+    motes = sorted(navigator.beacons.items())
+
+    def pose(t_s: float) -> tuple[float, float, float]:
+        now = heading + rate * (t_s - begun_s)
+        r = speed / rate
+        return x_m + r * (sin(now) - sin(heading)), y_m - r * (cos(now) - cos(heading)), now
+
+    last_s = begun_s
+    for k in range(1, 41):
+        t_s = begun_s + 0.1 * k
+        end_s, heard_s = t_s - 0.07, t_s - 0.03
+        wheels = Increment(end_s, end_s - last_s, speed * (end_s - last_s), rate * (end_s - last_s))
+        last_s = end_s
+        bursts = []
+        if motes:
+            name, (mote_x_m, mote_y_m, *_) = motes[k % len(motes)]
+            there = pose(heard_s)
+            delay_s = hypot(there[0] - mote_x_m, there[1] - mote_y_m) / 344.0
+            bursts = [MoteBurst(heard_s, name, "robot", 20.0, [delay_s])]
+        navigator.take(BeaconMeasurements(t_s, (wheels,), BeaconFrame(motes=bursts)))
+        if k > 1:  # before, the wheels have not told their speed for as long
+            assert navigator.belief.pose == pytest.approx(pose(t_s), abs=1e-3)  # 1 mm of the 21 mm since the wheels
+    assert navigator.score.refused == 0
 
 
 def test_fire_sends_the_robot_to_its_start() -> None:

@@ -121,6 +121,10 @@ REFUSED = [
         "run --sim --config zigbee --set follow.is_active=true",
         'sim.target.motion = "none": there is no radio that the simulated robot could follow; give "random"',
     ),
+    (
+        "run --sim --config cricket --set listener.mapping_rounds=20",
+        "listener.mapping_rounds = 20: the map needs cricket.ranging.repeats = 60 readings of each pair",
+    ),
     ("radio calibrate nowhere.csv", "no such file"),
     ("radio calibrate sheets/rnd.csv", "is not text; give a CSV file or an .xlsx workbook with columns of levels"),
     ("radio calibrate sheets/flat.csv", "flat.csv: levels do not fall with distance"),
