@@ -49,7 +49,7 @@ _DISAGREES = 0.5  # of the base's own speed, by which the encoders may differ fr
 _FAST_MM_S = 60.0  # speeds above are compared
 _CONTINUOUS = 2
 _IMPOSSIBLE = 3.0  # times the highest set point: no wheel turns so fast, a count was damaged
-_JUMPS, _JUMPS_S = 3, 10.0  # so many within this time are a fault
+_JUMPS, _JUMPS_S = 4, 10.0  # so many within this time are a fault; counts that are set to others give three
 _NEAREST_S = 0.05  # between two counts: those that were delayed on their way arrive together
 
 WheelSpeeds = tuple[float, float | None, float | None]  # time; mean speed of the right and left wheel since the last
