@@ -15,14 +15,15 @@ from ccatp.core import FloatArray, Measured, PointId
 from ccatp.errors import UsageError
 from ccatp.mirror.foreign_points import (
     Assigned,
+    CommonFigure,
     Fitted,
     ForeignPoint,
     Frame,
     PointsError,
     assign,
+    common_figure,
     fit_frame,
     frame_errors,
-    variance_factor,
     world_from,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror
@@ -52,7 +53,13 @@ class AlignedPoints(NamedTuple):
     assigned: Assigned
     result: SurveyResult
     fitted: Fitted | None
-    factor: float
+    figure: CommonFigure | None
+
+    @property
+    def factor(self) -> float:
+        """By which the claimed standard deviations are multiplied."""
+        repeats = self.assigned.repeats
+        return self.result.sigma_factor * (1.0 if repeats is None else repeats.excess**0.5)
 
     @property
     def lines(self) -> list[str]:
@@ -64,11 +71,23 @@ class AlignedPoints(NamedTuple):
                 f"frame of the instrument: fitted to {len(self.fitted.residuals_m)} reference points, residuals "
                 f"{residual_um:.1f} um rms in a coordinate; panels share its uncertainty"
             )
-        if self.assigned.repeat_sigma_m is not None:
+        if (figure := self.figure) is not None:
             lines.append(
-                f"repeated readings: {self.assigned.repeats} scatter by {1e6 * self.assigned.repeat_sigma_m:.1f} um "
-                f"along the normal, {1e6 * self.assigned.claimed_sigma_m:.1f} um are claimed"
+                f"the panels have in common {1e3 * figure.common_m:.3f} mm rms ({1e3 * figure.mean_m:+.3f} mm in the "
+                f"mean), and {1e3 * figure.own_m:.3f} mm rms of their own: check the target's offset, and frame and "
+                "scale of the instrument; the moves contain it, the standard deviations do not"
             )
+        if (repeats := self.assigned.repeats) is not None:
+            lines.append(
+                f"repeated readings: {repeats.readings} scatter by {1e6 * repeats.sigma_m:.1f} um along the normal, "
+                f"{1e6 * repeats.claimed_m:.1f} um are claimed"
+                + (f"; standard deviations are multiplied by {repeats.excess**0.5:.2f}" if repeats.excess > 1.0 else "")
+            )
+            if repeats.shift_m:
+                lines.append(
+                    f"the readings of a panel are shifted together by {1e6 * repeats.shift_m:.1f} um from one to the "
+                    "next: two nights, or two frames; align each on its own. All panels share the uncertainty"
+                )
         if self.assigned.by_position:
             lines.append(
                 f"{self.assigned.by_position} readings are assigned to panels by position, as their labels name none: "
@@ -79,11 +98,8 @@ class AlignedPoints(NamedTuple):
             for point in self._mentioned
             if self.assigned.labels[point] != "/".join(map(str, point))
         ]
-        if self.factor > 1.0:
-            lines.append(
-                f"standard deviations are multiplied by {self.factor**0.5:.2f}: the panels' residuals, or the repeated "
-                "readings, are larger than claimed"
-            )
+        if self.assigned.row_first:
+            lines.append("names as 12281 are read as telescope, mirror, row, column, number: so the points lie on them")
         return lines
 
     @property
@@ -99,13 +115,14 @@ class AlignedPoints(NamedTuple):
     @property
     def data(self) -> dict[str, Any]:
         """The same for ``--json``."""
-        assigned, fitted = self.assigned, self.fitted
+        assigned, fitted, repeats = self.assigned, self.fitted, self.assigned.repeats
         return {
             "targets": len(assigned.measured),
-            "sigma_factor": round(self.factor**0.5, 4),
-            "repeated": assigned.repeats,
-            "repeat_sigma_um": assigned.repeat_sigma_m and round(1e6 * assigned.repeat_sigma_m, 4),
-            "claimed_sigma_um": round(1e6 * assigned.claimed_sigma_m, 4),
+            "sigma_factor": round(self.factor, 4),
+            "repeated": repeats.readings if repeats else 0,
+            "repeat_sigma_um": repeats and round(1e6 * repeats.sigma_m, 4),
+            "claimed_sigma_um": round(1e6 * repeats.claimed_m, 4) if repeats else 0.0,
+            "repeat_shift_um": repeats and round(1e6 * repeats.shift_m, 4),
             "reference_residuals_um": fitted and (1e6 * fitted.residuals_m).round(4).tolist(),
             "labels": [{**point._asdict(), "label": label} for point, label in assigned.labels.items()],
         }
@@ -139,16 +156,14 @@ def align_points(run_dir: Path | None, settings: Mapping[str, object], options: 
         ForeignPoint(one.label, one.line, (x, y, z), _covariance(one, options, turn))
         for one, (x, y, z) in zip(readings, world.tolist(), strict=True)
     ]
-    assigned = assign(mirror, points, options.offset_m)
+    assigned = assign(mirror, points, options.offset_m, cfg.align.false_alarm)
+    repeats = assigned.repeats
+    measured = tuple(_scaled(one, 1.0 if repeats is None else repeats.excess) for one in assigned.measured)
+    planned = {one.point.panel for one in measured}
     shared = _shared(assigned, points, common_errors)
-    planned = {one.point.panel for one in assigned.measured}
-
-    def aligned(measured: tuple[Measured, ...]) -> SurveyResult:
-        return survey_result(mirror, cfg.align, options.offset_m, measured, planned, shared)
-
-    factor = variance_factor(aligned(assigned.measured), assigned)
-    result = aligned(tuple(_scaled(one, factor) for one in assigned.measured))
-    return AlignedPoints(cfg, mirror, assigned, result, fitted, factor)
+    result = survey_result(mirror, cfg.align, options.offset_m, measured, planned, shared)
+    figure = common_figure(mirror, result, cfg.align.false_alarm)
+    return AlignedPoints(cfg, mirror, assigned, result, fitted, figure)
 
 
 def _in_world(
@@ -193,11 +208,14 @@ def _covariance(one: Reading, options: PointOptions, turn: FloatArray) -> FloatA
 def _shared(
     assigned: Assigned, points: list[ForeignPoint], errors: FloatArray | None
 ) -> dict[PointId, FloatArray] | None:
-    """Errors of the frame, which all targets share; those of the first reading stand for all of a target."""
+    """Errors that all targets share: of the frame (those of the first reading stand for all of a target), of shifts."""
     if errors is None:
-        return None
+        return dict(assigned.shifts) or None
     at_line = {one.line: errors[at] for at, one in enumerate(points)}
-    return {one.point: at_line[round(one.fix.t_s)] for one in assigned.measured}
+    frame = {one.point: at_line[round(one.fix.t_s)] for one in assigned.measured}
+    return {
+        point: np.hstack([of_frame, assigned.shifts.get(point, np.zeros((3, 0)))]) for point, of_frame in frame.items()
+    }
 
 
 def _scaled(one: Measured, factor: float) -> Measured:

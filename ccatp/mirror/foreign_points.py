@@ -7,7 +7,7 @@ from itertools import permutations, product
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import fdtrc
 
 from ccatp.core import BoolArray, Fix, FloatArray, Measured, PanelId, PointId, Vector3
 from ccatp.errors import UsageError
@@ -18,6 +18,8 @@ from ccatp.mirror.surface import ConvergenceError
 Frame = Literal["world", "mirror", "telescope", "own"]
 _ON_MIRROR_M = 0.02  # a panel or a target is never further from the surface
 _SAME_PLACE_M = 0.003  # repeated readings of a target
+_REPEATS = 3  # least number of repeated readings that show a scatter
+_LEAST_MODE = 1e-3  # part of the largest mode from which a common one is told from the others
 _AXIS_SHIFT_M = 0.12  # between the optical frame and that of the azimuth axis, along the elevation axis
 _FRAME_RATIO = 10.0  # of residuals of the references without and with a mirrored axis, from which the frame is mirrored
 _TWICE = (1.8, 2.2)  # deviations over the target's offset if its sign is wrong
@@ -100,39 +102,63 @@ def frame_errors(fitted: Fitted, places_m: FloatArray) -> FloatArray:
 
 
 _OURS = re.compile(r"(\d{1,2})[/-](\d{1,2})(?:[/-](\w+))?$")
-_OBSERVATORY = re.compile(r"(\d)([12])(\d)(\d)(\d)(?:\D.*)?$")
+_OBSERVATORY = re.compile(r"(?:\d\d-\d\d|\d)([12])([1-9])([1-9])\d(?:\D.*)?$")
 
 
-def panel_of_label(label: str, mirror: Mirror) -> PanelId | None:
+def panel_of_label(label: str, mirror: Mirror, *, row_first: bool = False) -> PanelId | None:
     """The panel that a label names: ours, ``3/7`` or ``3/7/4``, or the observatory's ``12281``; None without a panel.
 
-    The observatory's digits: telescope, mirror, column, row, number. Raises ``PointsError``: it is of the other mirror.
+    The observatory's digits: telescope (also as ``01-01``), mirror, column, row, number; row before column with
+    ``row_first``. Raises ``PointsError``: it is of the other mirror.
     """
     if (match := _OURS.match(label)) is not None:
         panel = PanelId(int(match[1]), int(match[2]))
     elif (match := _OBSERVATORY.match(label)) is not None:
-        if mirror.name[-2:] in ("m1", "m2") and mirror.name[-1] != match[2]:
-            raise PointsError(f"label {label} is of mirror {match[2]}, the mirror is {mirror.name}; give --mirror")
-        panel = PanelId(int(match[4]), int(match[3]))
+        if mirror.name[-2:] in ("m1", "m2") and mirror.name[-1] != match[1]:
+            raise PointsError(f"label {label} is of mirror {match[1]}, the mirror is {mirror.name}; give --mirror")
+        first, second = int(match[2]), int(match[3])
+        panel = PanelId(first, second) if row_first else PanelId(second, first)
     else:
         return None
     if panel not in mirror.panels:
-        raise PointsError(f"label {label}: {mirror.name} has no panel in row {panel.row}, column {panel.col}")
+        raise PointsError(
+            f"label {label}: {mirror.name} has no panel in row {panel.row}, column {panel.col}; "
+            "leave out labels that name none"
+        )
     return panel
 
 
-class Assigned(NamedTuple):
-    """Measured points by panel, the point of each label, and how much repeated readings scatter.
+class Repeats(NamedTuple):
+    """Repeated readings of targets, along the normal, m.
 
-    ``by_position``: readings whose label names no panel.
+    ``readings``: beyond the first of each target. ``sigma_m``: of one reading, ``claimed_m``: as claimed. ``shift_m``:
+    standard deviation that the first, second, ... readings of a panel share, 0 if noise may make it.
+    """
+
+    readings: int
+    sigma_m: float
+    claimed_m: float
+    shift_m: float
+
+    @property
+    def excess(self) -> float:
+        """Their variance over the claimed one, at least 1; 1 with few of them."""
+        return max(1.0, (self.sigma_m / self.claimed_m) ** 2) if self.readings >= _REPEATS else 1.0
+
+
+class Assigned(NamedTuple):
+    """Measured points by panel, the label of each, and repeated readings; their mean is the point.
+
+    ``by_position``: readings whose label names no panel. ``row_first``: names of the observatory have the row first.
+    ``shifts`` (3, 1) of each point: the error of the mean that all points share by shifts between readings.
     """
 
     measured: tuple[Measured, ...]
     labels: Mapping[PointId, str]
     by_position: int
-    repeat_sigma_m: float | None
-    claimed_sigma_m: float
-    repeats: int
+    row_first: bool
+    repeats: Repeats | None
+    shifts: Mapping[PointId, FloatArray]
 
 
 def check_on_mirror(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float) -> FloatArray:
@@ -192,34 +218,26 @@ def _why_far(mirror: Mirror, points: Sequence[ForeignPoint], world: FloatArray, 
     return f"{where}: {off} of {len(points)} points lie elsewhere; check --mirror, --frame and the unit"
 
 
-def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float) -> Assigned:
+def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float, false_alarm: float) -> Assigned:
     """Points as measured points of their panels, by label or position; repeated readings become one point."""
     feet = check_on_mirror(mirror, points, offset_m)
+    there = [mirror.grid.nearest_panel(x, y) for x, y, _ in feet.tolist()]
+    named, row_first = _named(mirror, points, there)
     by_panel: dict[PanelId, list[int]] = defaultdict(list)
-    wrong: list[tuple[int, PanelId, PanelId]] = []
-    by_position = 0
-    for at, (one, (x, y, _)) in enumerate(zip(points, feet.tolist(), strict=True)):
-        there = mirror.grid.nearest_panel(x, y)
-        named = panel_of_label(one.label, mirror)
-        by_position += named is None
-        if named is not None and named != there:
-            wrong.append((at, named, there))
-        by_panel[there if named is None else named].append(at)
-    if wrong:
-        raise PointsError(_why_elsewhere(points, wrong, len(points)))
-    measured, labels = list[Measured](), {}
-    squares = claimed = 0.0
-    repeats = 0
+    for at, panel in enumerate(there):
+        by_panel[panel].append(at)
+    measured, labels, normals = list[Measured](), dict[PointId, str](), dict[PointId, tuple[FloatArray, int]]()
+    readings = list[list[FloatArray]]()
+    claimed = list[float]()
     for panel, rows in sorted(by_panel.items()):
         targets = _targets(points, rows)
+        readings.append([])
+        normal = np.array(mirror.rotate_world_from_deck(mirror.panel(panel).axes[2]))
         for number, same in zip(_numbers(points, targets), targets, strict=True):
             places = np.array([points[at].place_m for at in same])
             covariance = np.mean([points[at].covariance_m2 for at in same], axis=0)
-            normal = np.array(mirror.rotate_world_from_deck(mirror.panel(panel).axes[2]))
-            along = places @ normal
-            squares += float(np.sum((along - along.mean()) ** 2))
-            claimed += (len(same) - 1) * float(normal @ covariance @ normal)
-            repeats += len(same) - 1
+            readings[-1].append(places @ normal)
+            claimed += [float(normal @ covariance @ normal)] * (len(same) - 1)
             point = PointId(panel.row, panel.col, number)
             x, y, z = places.mean(axis=0).tolist()
             fix = Fix(
@@ -227,14 +245,69 @@ def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float) -> A
             )
             measured.append(Measured(point, fix))
             labels[point] = points[same[0]].label
+            normals[point] = normal, len(same)
+    repeats = _repeats(readings, claimed, false_alarm) if claimed else None
+    shift_m = 0.0 if repeats is None else repeats.shift_m
     return Assigned(
         tuple(measured),
         labels,
-        by_position,
-        repeat_sigma_m=float(np.sqrt(squares / repeats)) if repeats else None,
-        claimed_sigma_m=float(np.sqrt(claimed / repeats)) if repeats else 0.0,
+        by_position=sum(panel is None for panel in named),
+        row_first=row_first,
         repeats=repeats,
+        shifts={
+            point: shift_m / np.sqrt(count) * normal[:, None] for point, (normal, count) in normals.items() if shift_m
+        },
     )
+
+
+def _named(
+    mirror: Mirror, points: Sequence[ForeignPoint], there: Sequence[PanelId]
+) -> tuple[list[PanelId | None], bool]:
+    """The panels that the labels name, and whether the observatory's names have the row first.
+
+    Both orders are in use, and the places tell which one it is. Raises ``PointsError``: a label names another panel
+    than the one on which its point lies.
+    """
+    problems = list[PointsError]()
+    for row_first in (False, True):
+        try:
+            named = [panel_of_label(one.label, mirror, row_first=row_first) for one in points]
+        except PointsError as error:
+            problems.append(error)
+            continue
+        wrong = [
+            (at, panel, other)
+            for at, (panel, other) in enumerate(zip(named, there, strict=True))
+            if panel not in (None, other)
+        ]
+        if not wrong:
+            return named, row_first
+        problems.append(PointsError(_why_elsewhere(points, wrong, len(points))))
+    raise problems[0]
+
+
+def _repeats(readings: Sequence[Sequence[FloatArray]], claimed: Sequence[float], false_alarm: float) -> Repeats:
+    """Analysis of variance of the repeated readings of each panel's targets, m, by target and order of reading.
+
+    A night or an instrument that differs from the other shifts all its readings alike: their mean is not better by
+    the number of the points.
+    """
+    own = np.zeros(2)  # sum of squares, degrees of freedom
+    shifts, sizes = np.zeros(2), list[int]()
+    for targets in readings:
+        for count in {len(one) for one in targets} - {1}:
+            table = np.array([one - one.mean() for one in targets if len(one) == count])
+            means = table.mean(axis=0)
+            own += float(np.sum((table - means) ** 2)), (count - 1) * (len(table) - 1)
+            shifts += len(table) * float(means @ means), count - 1
+            sizes += [len(table)] * (count - 1)
+    total, dof = own + shifts
+    if own[1] > 0 and own[0] > 0.0:
+        variances = own[0] / own[1], shifts[0] / shifts[1]
+        if float(fdtrc(shifts[1], own[1], variances[1] / variances[0])) < false_alarm:
+            shift_m = float(np.sqrt((variances[1] - variances[0]) / np.mean(sizes)))
+            return Repeats(len(claimed), float(np.sqrt(variances[0])), float(np.sqrt(np.mean(claimed))), shift_m)
+    return Repeats(len(claimed), float(np.sqrt(total / dof)), float(np.sqrt(np.mean(claimed))), 0.0)
 
 
 def _why_elsewhere(points: Sequence[ForeignPoint], wrong: Sequence[tuple[int, PanelId, PanelId]], total: int) -> str:
@@ -275,11 +348,38 @@ def _numbers(points: Sequence[ForeignPoint], targets: Sequence[Sequence[int]]) -
     return [*found]
 
 
-def variance_factor(result: SurveyResult, assigned: Assigned) -> float:
-    """Variance that the data show over the claimed one, at least 1: of panels' residuals, and of repeated readings."""
-    ratios = [panel.fit.chi2 / float(chdtri(panel.fit.dof, 0.5)) for panel in result.panels if panel.fit.dof > 0]
-    by_panels = float(np.median(ratios)) if ratios else 1.0
-    by_repeats = 1.0
-    if assigned.repeat_sigma_m is not None and assigned.repeats >= 3:
-        by_repeats = (assigned.repeat_sigma_m / assigned.claimed_sigma_m) ** 2
-    return max(1.0, by_panels, by_repeats)
+class CommonFigure(NamedTuple):
+    """What all panels have in common: a shift, a turn, an expansion of the figure, or an offset along the normal, m.
+
+    ``mean_m``: mean of the pistons; ``common_m`` and ``own_m``: rms of what they have in common, and of the rest.
+    """
+
+    mean_m: float
+    common_m: float
+    own_m: float
+
+
+def common_figure(mirror: Mirror, result: SurveyResult, false_alarm: float) -> CommonFigure | None:
+    """What the panels have in common, by their pistons; None if panels that lie anyhow may have it.
+
+    An error of the frame, of the scale, or of the target's offset moves all panels so. A few panels have only a mean.
+    """
+    pistons = np.array([panel.fit.values[0] for panel in result.panels])
+    bodies = [mirror.panel(panel.panel) for panel in result.panels]
+    normals = np.array([mirror.rotate_world_from_deck(body.axes[2]) for body in bodies]).reshape(-1, 3)
+    places = np.array([mirror.world_from_deck(body.origin) for body in bodies]).reshape(-1, 3)
+    ones = np.ones((len(pistons), 1))
+    expansion = np.sum(places * normals, axis=1)[:, None]
+    modes = np.hstack([ones, normals, np.cross(places, normals), expansion])
+    for some in (modes, ones):
+        axes, sizes, _ = np.linalg.svd(some, full_matrices=False)
+        axes = axes[:, sizes > _LEAST_MODE * sizes.max(initial=0.0)]
+        rest = len(pistons) - axes.shape[1]
+        if rest < max(axes.shape[1], 1):
+            continue
+        common = axes @ (axes.T @ pistons)
+        squares = float(common @ common), float(np.sum((pistons - common) ** 2))
+        ratio = squares[0] / axes.shape[1] / max(squares[1] / rest, 1e-18)
+        if float(fdtrc(axes.shape[1], rest, ratio)) < false_alarm:
+            return CommonFigure(float(pistons.mean()), *(float(np.sqrt(one / len(pistons))) for one in squares))
+    return None

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.special import chdtri
+from scipy.special import betainc, chdtrc, chdtri
 
 from ccatp.config.models import AlignConfig, Config
 from ccatp.core import UNRELIABLE, FloatArray, Measured, PanelId, PointId, Vector3
@@ -18,6 +19,7 @@ from ccatp.mirror.panel_alignment import (
     MirrorWavefront,
     PanelResult,
     Prices,
+    all_points,
     cos_incidence,
     deviations_of,
     mirror_wavefront,
@@ -28,6 +30,8 @@ from ccatp.mirror.surface import ConvergenceError
 
 ENOUGH = 3  # points of a plane
 _NAMED = 12  # largest number of unreliable points that are named
+_FEW = 3  # panels, of which most may have outliers
+_MOST_PASSES = 5  # of the fit of all panels with larger sigmas
 
 
 class Undetermined(NamedTuple):
@@ -43,7 +47,8 @@ class SurveyResult:
     """Alignment of the panels of a mirror, sorted by row and column.
 
     ``wavefront``: with rigid moves (None without a fitted panel); ``wavefront_bent``: with moves that bend the panels
-    (None if a panel has too few points for them); ``price``: of outliers and shapes.
+    (None if a panel has too few points for them); ``price``: of outliers and shapes. ``sigma_factor``: by which the
+    sigmas of all points are multiplied, as they scatter about the panels by more than they are uncertain.
     """
 
     panels: tuple[PanelResult, ...]
@@ -51,6 +56,7 @@ class SurveyResult:
     wavefront: MirrorWavefront | None
     wavefront_bent: MirrorWavefront | None
     price: Prices
+    sigma_factor: float
     warnings: tuple[str, ...]
 
 
@@ -110,14 +116,34 @@ def survey_result(
         warnings.append(f"no light is configured for {mirror.name} (align.light): its angle of incidence is taken as 0")
     warnings += _unreliable(by_panel.values())
     price = prices(cfg.false_alarm, sum(len(found.points) for found in usable.values()), len(usable))
-    panels = []
-    for panel, found in usable.items():
-        result = panel_result(mirror, panel, found, price, cos_incidence(mirror, panel, light))
-        if result is None:
-            undetermined.append(Undetermined(panel, len(found.points), "its points lie on one line"))
-        else:
-            panels.append(result)
-    warnings += [line for panel in panels for line in _remarks(panel, cfg.false_alarm / len(panels))]
+    cosines = {panel: cos_incidence(mirror, panel, light) for panel in usable}
+
+    def fitted(variance: float) -> dict[PanelId, PanelResult | None]:
+        return {
+            panel: panel_result(mirror, panel, found.scaled(sqrt(variance)), price, cosines[panel])
+            for panel, found in usable.items()
+        }
+
+    variance, results = 1.0, fitted(1.0)
+    for _ in range(_MOST_PASSES):
+        # With larger sigmas fewer points are outliers, and the scatter of the others is larger.
+        more = excess_variance([result for result in results.values() if result is not None], cfg.false_alarm)
+        if more == 1.0:
+            break
+        variance *= more
+        results = fitted(variance)
+    panels = [result for result in results.values() if result is not None]
+    undetermined += [
+        Undetermined(panel, len(usable[panel].points), "its points lie on one line")
+        for panel, result in results.items()
+        if result is None
+    ]
+    if variance > 1.0:
+        warnings.append(
+            f"the points scatter about the panels {sqrt(variance):.2f} times as much as they are uncertain: their "
+            "standard deviations are multiplied by it"
+        )
+    warnings += [line for panel in panels for line in _remarks(panel)]
     bent = [panel.bending.wavefront for panel in panels if panel.bending is not None]
     return SurveyResult(
         panels=tuple(panels),
@@ -125,8 +151,28 @@ def survey_result(
         wavefront=mirror_wavefront([panel.rigid.wavefront for panel in panels]),
         wavefront_bent=mirror_wavefront(bent) if len(bent) == len(panels) else None,
         price=price,
+        sigma_factor=sqrt(variance),
         warnings=tuple(warnings),
     )
+
+
+def excess_variance(panels: Sequence[PanelResult], false_alarm: float) -> float:
+    """Variance of the points about the panels over the stated one, by the median panel; 1 if noise may make it.
+
+    If most panels have outliers, their points are none: all are counted.
+    """
+    are_outliers_rare = len(panels) < _FEW or 2 * sum(bool(panel.outliers) for panel in panels) <= len(panels)
+    models = [panel.model if are_outliers_rare else all_points(panel.deviations) for panel in panels]
+    found = [(one.chi2, one.dof) for one in models if one is not None and one.dof > 0]
+    if not found:
+        return 1.0
+    chi2, dof = np.array(found).T
+    half = len(found) // 2 + 1
+    chance = float(np.sort(chdtrc(dof, chi2))[half - 1])
+    # The probability that so many of the panels have such a chance, or a smaller one, is a binomial one.
+    if float(betainc(half, len(found) - half + 1, chance)) >= false_alarm:
+        return 1.0
+    return max(1.0, float(np.median(chi2 / chdtri(dof, 0.5))))
 
 
 def _deviations(
@@ -166,7 +212,7 @@ def _unreliable(by_panel: Iterable[Sequence[Measured]]) -> list[str]:
     return [f"not used, their lengths contradict each other: {names}{more}; check the laser, measure them again"]
 
 
-def _remarks(result: PanelResult, rare: float) -> list[str]:
+def _remarks(result: PanelResult) -> list[str]:
     where = f"panel {result.panel.row}/{result.panel.col}"
     lines = []
     if result.alternatives:
@@ -179,10 +225,11 @@ def _remarks(result: PanelResult, rare: float) -> list[str]:
     elif result.outliers:
         names = ", ".join(f"{row}/{col}/{number}" for row, col, number in result.outliers)
         lines.append(f"{where}: not used, because they are outliers: {names}; measure them again")
-    if result.probability < rare:
+    if result.sigma_factor > 1.0:
         lines.append(
             f"{where}: its points contradict each other by more than they are uncertain (chance "
-            f"{result.probability:.1g} with {result.model.dof} degrees of freedom); its sigmas are too small"
+            f"{result.probability:.1g} with {result.model.dof} degrees of freedom); its standard deviations are "
+            f"multiplied by {result.sigma_factor:.1f}"
         )
     return lines
 

@@ -8,7 +8,7 @@ twist and bowl, which five adjusters can change. The method is in docs/align.md.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from math import sqrt
+from math import exp, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +37,10 @@ class Deviations(NamedTuple):
     lever: FloatArray
     metrology: tuple[str, ...] = ()
     common: FloatArray | None = None
+
+    def scaled(self, factor: float) -> "Deviations":
+        """With ``factor`` times the sigmas."""
+        return self._replace(sigmas_m=factor * self.sigmas_m)
 
 
 def deviations_of(
@@ -104,6 +108,13 @@ def adjustable(places_m: FloatArray) -> FloatArray:
     return np.column_stack([rigid(places_m), x * y, (x * x + y * y) / 2.0])
 
 
+_SIX = np.eye(6)
+_IN_QUADRATIC: Mapping[Modes, FloatArray] = {
+    rigid: _SIX[:, :3], adjustable: np.column_stack([_SIX[:, :3], _SIX[:, 4], _SIX[:, 3] + _SIX[:, 5]]),
+}  # fmt: skip
+"""The modes as combinations of the quadratic ones, (6, m)."""
+
+
 class ModeFit(NamedTuple):
     """Coefficients (m,) by weighted least squares, in m, rad and 1/m, with their covariance (m, m) and residuals (k,).
 
@@ -120,9 +131,9 @@ class ModeFit(NamedTuple):
     dof: int
     common: FloatArray
 
-    def widened(self, spread: FloatArray) -> "ModeFit":
-        """With additional covariance (3, 3) of piston, tip and tilt, the first coefficients."""
-        covariance = self.covariance.copy()
+    def widened(self, spread: FloatArray, factor: float = 1.0) -> "ModeFit":
+        """With ``factor`` times its own covariance, and that (3, 3) of piston, tip and tilt, the first coefficients."""
+        covariance = self.covariance + (factor - 1.0) * self.own_covariance
         covariance[:3, :3] += spread
         return self._replace(covariance=covariance)
 
@@ -176,6 +187,32 @@ def fit_modes(
     )
 
 
+def fit_bent(deviations: Deviations, is_kept: BoolArray, modes: Modes, half_m: tuple[float, float]) -> ModeFit | None:
+    """The ``modes`` that remove most of a bent panel over its area: of its fit with three curvatures.
+
+    So they do not depend on which points were measured or left out. Chi-square and degrees of freedom are those of a
+    fit of the modes alone. None if the points do not determine all six coefficients.
+    """
+    places, lever = deviations.places_m[is_kept], deviations.lever[is_kept, None]
+    values, sigmas = deviations.values_m[is_kept], deviations.sigmas_m[is_kept]
+    common = None if deviations.common is None else deviations.common[is_kept]
+    design, own = lever * quadratic(places), lever * modes(places)
+    full, alone = fit_modes(design, values, sigmas, common), fit_modes(own, values, sigmas, common)
+    if full is None or alone is None:
+        return None
+    chosen, products = _IN_QUADRATIC[modes], gram(quadratic, half_m)
+    over_area = np.linalg.solve(chosen.T @ products @ chosen, chosen.T @ products)
+    operator = own @ over_area @ full.own_covariance @ (design / sigmas[:, None] ** 2).T
+    left = (np.eye(len(values)) - operator) * sigmas
+    return alone._replace(
+        values=over_area @ full.values,
+        covariance=over_area @ full.covariance @ over_area.T,
+        residuals_m=values - own @ over_area @ full.values,
+        residual_variance_m2=float(np.mean(np.sum(left**2, axis=1))),
+        common=over_area @ full.common,
+    )
+
+
 def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
     """Mean G of the products of modes over a panel with half sizes ``half_m``; c^T G c is the mean square of D."""
     x, y = np.meshgrid(_NODES * half_m[0], _NODES * half_m[1])
@@ -222,17 +259,20 @@ _MOST_LEFT_OUT, _MANY = 2, 20
 
 
 class Prices(NamedTuple):
-    """Least reduction of the chi-square to leave out a point, and to use the three curvatures of a panel."""
+    """Least reduction of the chi-square to leave out a point, and to use the three curvatures of a panel.
+
+    ``contradiction``: chance of the chi-square of a panel by noise below which its points contradict each other.
+    """
 
     outlier: float
     shape: float
+    contradiction: float
 
 
 def prices(false_alarm: float, points: int, panels: int) -> Prices:
     """The prices for a ``false_alarm`` probability of an outlier, or of a shape, by noise on the whole mirror."""
-    return Prices(
-        float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, false_alarm / max(panels, 1)))
-    )
+    of_panel = false_alarm / max(panels, 1)
+    return Prices(float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, of_panel)), of_panel)
 
 
 class Explanation(NamedTuple):
@@ -257,13 +297,12 @@ UNDECIDED = 13.8
 
 
 def explain(deviations: Deviations, price: Prices) -> tuple[Explanation, ...]:
-    """The cheapest explanation of a panel's deviations, then others that the points do not exclude.
+    """All explanations of a panel's deviations that the points do not exclude, the cheapest first.
 
     All points are kept if the panel cannot be fitted, or has too few redundant points. A plain panel has no others.
     """
     count = len(deviations.points)
     target = deviations.values_m / deviations.sigmas_m
-    plain = Explanation(np.ones(count, dtype=np.bool_), has_shape=False, cost=np.inf)
     found, lowest = list[Explanation](), np.inf
     for modes, needed in ((rigid, 3), (quadratic, 6)):
         has_shape = modes is quadratic
@@ -278,18 +317,33 @@ def explain(deviations: Deviations, price: Prices) -> tuple[Explanation, ...]:
             if cost < lowest + UNDECIDED:
                 found.append(Explanation(is_kept, has_shape, cost))
             lowest = min(lowest, cost)
-    found.sort(key=lambda one: one.cost)
-    if not found or not np.isfinite(lowest):
-        return (plain,)
-    best = found[0]
-    if best.is_plain:
-        return (best,)
-    others = [one for one in found[1:] if one.cost < lowest + UNDECIDED and not one.is_plain]
-    rivals: list[Explanation] = []
+    if not np.isfinite(lowest):
+        return (_plain(deviations),)
+    found = sorted((one for one in found if one.cost < lowest + UNDECIDED), key=lambda one: one.cost)
+    return tuple(found[:1] if found[0].is_plain else found)
+
+
+def _plain(deviations: Deviations) -> Explanation:
+    """A rigid panel with all its points."""
+    return Explanation(np.ones(len(deviations.points), dtype=np.bool_), has_shape=False, cost=np.inf)
+
+
+def _contradicts(one: Explanation, price: Prices) -> bool:
+    """Whether the points that an explanation keeps contradict each other nevertheless."""
+    kept = int(np.count_nonzero(one.is_kept))
+    dof = kept - (6 if one.has_shape else 3)
+    chi2 = one.cost - price.outlier * (len(one.is_kept) - kept) - price.shape * one.has_shape
+    return dof > 0 and np.isfinite(chi2) and bool(chdtrc(dof, max(chi2, 0.0)) < price.contradiction)
+
+
+def rivals(explanations: Sequence[Explanation]) -> tuple[Explanation, ...]:
+    """Those that say something else than the cheapest one, and not only more of the same."""
+    best, *others = explanations
+    found: list[Explanation] = []
     for one in others:
-        if not any(one.extends(other) for other in (best, *rivals)):
-            rivals.append(one)
-    return (best, *rivals)
+        if not (one.is_plain or any(one.extends(other) for other in (best, *found))):
+            found.append(one)
+    return tuple(found)
 
 
 def _subsets(count: int, most: int) -> Iterator[BoolArray]:
@@ -427,13 +481,13 @@ class AdjusterPlan(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PanelResult:
-    """Alignment of a panel: rigid fit (piston, m; tip, tilt, rad), also for a bent panel.
+    """Alignment of a panel: piston, m, tip and tilt, rad; of a bent panel those of the plane that fits its area best.
 
-    The adjusters can correct these without bending the panel; in a fit with three curvatures the sigma of the piston
-    would be more than twice as large. ``is_kept`` (k,): the points that are not outliers. ``shape``, and ``bending``
-    (moves that also remove twist and bowl), are None if there are too few points. ``alternatives``: other explanations
-    of the deviations that the points do not exclude; the covariances contain the differences. ``deciding``: the point
-    at which the explanations differ most; measured again, it decides between them.
+    The adjusters can correct these without bending the panel. ``is_kept`` (k,): the points that are not outliers.
+    ``shape``, and ``bending`` (moves that also remove twist and bowl), are None if there are too few points.
+    ``sigma_factor``: by which the standard deviations are multiplied, as the points contradict each other.
+    ``alternatives``: other explanations of the deviations that the points do not exclude; the covariances contain the
+    differences. ``deciding``: the point at which the explanations differ most; measured again, it decides between them.
     """
 
     panel: PanelId
@@ -445,6 +499,7 @@ class PanelResult:
     adjusters: tuple[str, ...]
     rigid: AdjusterPlan
     bending: AdjusterPlan | None
+    sigma_factor: float = 1.0
     alternatives: tuple[Explanation, ...] = ()
     deciding: PointId | None = None
 
@@ -474,29 +529,40 @@ def panel_result(
     mirror: Mirror, panel: PanelId, deviations: Deviations, price: Prices, cos_i: float
 ) -> PanelResult | None:
     """Fit a panel; None if its points do not determine piston, tip and tilt."""
-    best, *others = explain(deviations, price)
+    explanations = explain(deviations, price)
+    factor = 1.0
+    if _contradicts(explanations[0], price):
+        # No explanation holds: the points scatter as they do.
+        explanations = (_plain(deviations),)
+        every = fit_modes(
+            deviations.lever[:, None] * rigid(deviations.places_m), deviations.values_m, deviations.sigmas_m
+        )
+        factor = 1.0 if every is None else max(every.chi2 / every.dof, 1.0)
+    best, others = explanations[0], rivals(explanations)
     kept, has_shape = best.is_kept, best.has_shape
     places, lever = deviations.places_m[kept], deviations.lever[kept, None]
     values, sigmas = deviations.values_m[kept], deviations.sigmas_m[kept]
     common = None if deviations.common is None else deviations.common[kept]
-    fit = fit_modes(lever * rigid(places), values, sigmas, common)
+    body = mirror.panel(panel)
+    half_m = half_size_m(body)
+    fit = _fit_of(deviations, best, rigid, half_m)
     if fit is None:
         return None
-    spread = _spread(deviations, best, others)
-    fit = fit.widened(spread)
-    body = mirror.panel(panel)
+    full = fit_modes(lever * quadratic(places), values, sigmas, common)
+    spread = _spread(deviations, explanations, others, half_m)
+    fit = fit.widened(spread, factor)
     names, adjusters = adjuster_places(mirror, panel)
 
     def plan(found: ModeFit, modes: Modes) -> AdjusterPlan:
-        wavefront = panel_wavefront(body, cos_i, found, gram(modes, half_size_m(body)), sigmas)
+        wavefront = panel_wavefront(body, cos_i, found, gram(modes, half_m), sigmas)
         return AdjusterPlan(adjuster_moves(found, modes, adjusters), wavefront)
 
-    bent = fit_modes(lever * adjustable(places), values, sigmas, common)
-    bent = None if bent is None else bent.widened(spread)
-    full = fit_modes(lever * quadratic(places), values, sigmas, common)
+    bent = _fit_of(deviations, best, adjustable, half_m)
+    bent = None if bent is None else bent.widened(spread, factor)
     shape = None
     if full is not None:
-        gain = fit.chi2 - full.chi2
+        plane = fit_modes(lever * rigid(places), values, sigmas)
+        gain = 0.0 if plane is None else plane.chi2 - full.chi2
         chance = float(chdtrc(_CURVATURES, max(gain, 0.0)))
         values_1_m, sigma_1_m = full.values[SHAPE], full.sigma[SHAPE]
         shape = PanelShape(values_1_m, sigma_1_m, gain, chance, full.chi2, full.dof, has_shape)
@@ -510,23 +576,48 @@ def panel_result(
         adjusters=names,
         rigid=plan(fit, rigid),
         bending=None if bent is None else plan(bent, adjustable),
-        alternatives=tuple(others),
+        sigma_factor=sqrt(factor),
+        alternatives=others,
         deciding=_deciding(deviations, [best, *others]) if others else None,
     )
 
 
-def _fit_of(deviations: Deviations, one: Explanation, modes: Modes) -> ModeFit | None:
+def _fit_of(deviations: Deviations, one: Explanation, modes: Modes, half_m: tuple[float, float]) -> ModeFit | None:
+    """The ``modes`` of a panel by one explanation."""
     kept = one.is_kept
+    if one.has_shape:
+        return fit_bent(deviations, kept, modes, half_m)
+    common = None if deviations.common is None else deviations.common[kept]
     design = deviations.lever[kept, None] * modes(deviations.places_m[kept])
-    return fit_modes(design, deviations.values_m[kept], deviations.sigmas_m[kept])
+    return fit_modes(design, deviations.values_m[kept], deviations.sigmas_m[kept], common)
 
 
-def _spread(deviations: Deviations, best: Explanation, others: Sequence[Explanation]) -> FloatArray:
-    """Mean square differences (3, 3) of the planes of other explanations from that of the best."""
-    planes = [_fit_of(deviations, one, rigid) for one in (best, *others)]
-    values = np.array([plane.values for plane in planes if plane is not None]).reshape(-1, 3)
-    differences = values[1:] - values[:1]
-    return np.asarray(differences.T @ differences / max(len(differences), 1))
+def all_points(deviations: Deviations) -> ModeFit | None:
+    """The fit of all points, with curvatures if that leaves redundant points as for one outlier."""
+    modes = quadratic if len(deviations.points) >= _SIX.shape[0] + REDUNDANCY else rigid
+    return fit_modes(deviations.lever[:, None] * modes(deviations.places_m), deviations.values_m, deviations.sigmas_m)
+
+
+def _spread(
+    deviations: Deviations,
+    explanations: Sequence[Explanation],
+    others: Sequence[Explanation],
+    half_m: tuple[float, float],
+) -> FloatArray:
+    """Mean square differences (3, 3) of the planes of other explanations from that of the best.
+
+    The rivals have equal weights. Those that only say more of the same have their probability with these points.
+    """
+    best, *rest = explanations
+    weights = {id(one): 1.0 / len(others) for one in others}
+    found = np.zeros((3, 3))
+    plane = _fit_of(deviations, best, rigid, half_m)
+    for one in rest:
+        fit = _fit_of(deviations, one, rigid, half_m)
+        if fit is not None and plane is not None:
+            difference = fit.values - plane.values
+            found += weights.get(id(one), exp(-0.5 * (one.cost - best.cost))) * np.outer(difference, difference)
+    return found
 
 
 def _deciding(deviations: Deviations, explanations: Sequence[Explanation]) -> PointId:
@@ -534,7 +625,9 @@ def _deciding(deviations: Deviations, explanations: Sequence[Explanation]) -> Po
     surfaces = []
     for one in explanations:
         modes = quadratic if one.has_shape else rigid
-        if (fit := _fit_of(deviations, one, modes)) is not None:
+        design = deviations.lever[one.is_kept, None] * modes(deviations.places_m[one.is_kept])
+        fit = fit_modes(design, deviations.values_m[one.is_kept], deviations.sigmas_m[one.is_kept])
+        if fit is not None:
             surfaces.append(modes(deviations.places_m) @ fit.values)
     return deviations.points[int(np.argmax(np.ptp(np.array(surfaces), axis=0)))]
 

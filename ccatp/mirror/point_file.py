@@ -20,11 +20,14 @@ _NAMES = {
     "x": ("x",), "y": ("y",), "z": ("z",),
     "sx": ("sx", "sigma x", "sigmax", "ux", "std x", "stdx"), "sy": ("sy", "sigma y", "sigmay", "uy", "std y", "stdy"),
     "sz": ("sz", "sigma z", "sigmaz", "uz", "std z", "stdz"), "sigma": ("sigma", "s", "std", "u"),
+    "used": ("enabled", "active", "used", "use"),
 }  # fmt: skip
 _PLACE, _SIGMAS = ("x", "y", "z"), ("sx", "sy", "sz")
 _ORDERS = {4: ("label", *_PLACE), 5: ("label", *_PLACE, "sigma"), 7: ("label", *_PLACE, *_SIGMAS)}
+_WITH_ZERO = 8  # columns of a photogrammetric export: as with seven, and a 0
 _WITHOUT_LABEL = {3: _PLACE, 6: (*_PLACE, *_SIGMAS)}
 _FORM = "label, x, y, z, sx, sy, sz"
+_YES = ("1", "checked", "on", "true", "x", "yes")
 # Numbers with a decimal point, and with a decimal comma; "1,234" and "1.234" are both.
 _BY_POINT = re.compile(r"[+-]?(\d{1,3}(,\d{3})+|\d+)?(\.\d*)?([eE][+-]?\d+)?$")
 _BY_COMMA = re.compile(r"[+-]?(\d{1,3}(\.\d{3})+|\d+)?(,\d*)?([eE][+-]?\d+)?$")
@@ -65,7 +68,7 @@ class _Row(NamedTuple):
         return [
             _plain(self.cells[column.at])
             for key, column in self.columns.items()
-            if key != "label" and column.at < len(self.cells)
+            if key not in ("label", "used") and column.at < len(self.cells)
         ]
 
 
@@ -153,9 +156,14 @@ def _unit(name: str, header: Mapping[str, _Column], unit: str | None) -> str:
 
 def _by_count(name: str, line: int, cells: Sequence[str]) -> dict[str, _Column]:
     has_label = len(cells) not in _WITHOUT_LABEL or not _is_number(cells[0])
-    order = (_ORDERS if has_label else _WITHOUT_LABEL).get(len(cells))
+    count = len(cells)
+    if count == _WITH_ZERO and _number(_plain(cells[-1]), has_decimal_comma="," in cells[-1]) == 0.0:
+        count -= 1
+    order = (_ORDERS if has_label else _WITHOUT_LABEL).get(count)
     if order is None:
-        raise PointFileError(f"{name}:{line}: {len(cells)} columns; a line is: {_FORM}")
+        raise PointFileError(
+            f"{name}:{line}: {len(cells)} columns; a line is: {_FORM}; of more columns a first line has to name these"
+        )
     return {key: _Column(at) for at, key in enumerate(order)}
 
 
@@ -193,9 +201,11 @@ def _number(text: str, has_decimal_comma: bool) -> float | None:
 def _reading(name: str, row: _Row, unit: str, has_decimal_comma: bool) -> Reading:
     where, values = f"{name}:{row.line}", {}
     for key, column in row.columns.items():
-        if key == "label":
-            continue
         cell = row.cells[column.at] if column.at < len(row.cells) else ""
+        if key == "used" and cell.lower() not in _YES:
+            raise PointFileError(f"{where}: is marked {cell!r}: put # before a line that is not to be used")
+        if key in ("label", "used"):
+            continue
         number = _number(_plain(cell), has_decimal_comma)
         if number is None:
             what = repr(cell) if cell else "nothing"

@@ -1,6 +1,7 @@
 """Points of other instruments: how files are read, which frames, panels and sigmas they get, and what is refused."""
 
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 
 from ccatp.cli import main
-from ccatp.core import FloatArray, PanelId
+from ccatp.core import DeckPose, FloatArray, PanelId
 from ccatp.mirror.foreign_points import PointsError, fit_frame, panel_of_label, world_from
+from ccatp.mirror.misalignment import misaligned_puck_world
 from ccatp.mirror.point_file import PointFileError, parse_points
+from ccatp.sim.world import draw_misalignments
 from tests.support.command import answered
-from tests.support.scenario import world_of
+from tests.support.scenario import config_of, world_of
 from tests.support.targets import M1, OFFSET_M, SIGMA_UM, is_recovered, labels, places, rows
 
 
@@ -75,7 +78,10 @@ def test_labels_name_panels_as_ours_and_as_those_of_the_observatory() -> None:
     assert panel_of_label("3/7/4", M1) == panel_of_label("3-7", M1) == PanelId(3, 7)
     # Telescope, mirror, column, row, number.
     assert panel_of_label("11731", M1) == panel_of_label("11731_T04", M1) == PanelId(3, 7)
-    assert panel_of_label("TARGET 9", M1) is None
+    assert (
+        panel_of_label("11371", M1, row_first=True) == panel_of_label("01-011371", M1, row_first=True) == PanelId(3, 7)
+    )
+    assert panel_of_label("TARGET 9", M1) is panel_of_label("11001", M1) is None
     with pytest.raises(PointsError, match="label 12281 is of mirror 2"):
         panel_of_label("12281", M1)
     with pytest.raises(PointsError, match="no panel in row 1, column 1"):
@@ -180,7 +186,68 @@ def test_repeated_readings_that_scatter_more_than_claimed_scale_the_sigmas(align
     assert found["instrument"]["repeat_sigma_um"] == pytest.approx(40.0, rel=0.3)
     assert found["instrument"]["sigma_factor"] == pytest.approx(40.0 / SIGMA_UM, rel=0.35)
     assert is_recovered(found, 4.0)
+    assert found["instrument"]["repeat_shift_um"] == 0.0
     assert any("standard deviations are multiplied by" in line for line in found["warnings"])
+
+
+def test_readings_of_two_nights_that_differ_are_no_better_by_their_number(aligned: Callable[..., Any]) -> None:
+    second = places(seed=2) + np.array([0.0, 0.0, 0.1])
+    found = aligned([line for one in (places(seed=1), second) for line in rows(one, labels())])
+    # Along the normals, which are some 30 degrees from z; a standard deviation of two values.
+    assert found["instrument"]["repeat_shift_um"] == pytest.approx(100.0 * 0.87 / 2**0.5, rel=0.25)
+    assert found["instrument"]["sigma_factor"] == 1.0
+    assert all(panel["sigma"][0] > 35.0 for panel in found["panels"])
+    assert is_recovered(found, 3.0)
+    assert any("two nights, or two frames" in line for line in found["warnings"])
+
+
+def of_mirror(error: Callable[[FloatArray], FloatArray]) -> list[str]:
+    """Lines of a target at each corner of each panel, which lie anyhow; ``error`` of their coordinates, mm."""
+    rng, found, names = np.random.default_rng(9), [], []
+    for panel, lies in draw_misalignments(M1.panels, config_of(), rng).items():
+        body = M1.panel(panel)
+        for k, (x, y) in enumerate(product((-0.28, 0.28), (-0.3, 0.3))):
+            pose = DeckPose(body.x_m + x, body.y_m + y, 0.0)
+            found.append(misaligned_puck_world(M1, panel, lies, pose, OFFSET_M))
+            names.append(f"{panel.row}/{panel.col}/{k + 1}")
+    points = 1e3 * np.array(found) + 0.01 * rng.normal(size=(len(found), 3))
+    return rows(points + error(points), names)
+
+
+COMMON: dict[str, tuple[Callable[[FloatArray], FloatArray], float]] = {
+    "none": (lambda points: 0.0 * points, 0.0),
+    "offset": (lambda points: 0.0 * points, 0.2),
+    "shift": (lambda points: 0.0 * points + [0.1, 0.0, 0.2], 0.0),
+    "turn": (lambda points: np.cross([1e-4, 0.0, 0.0], points), 0.0),
+    "scale": (lambda points: 3e-5 * points, 0.0),
+}
+
+
+@pytest.mark.parametrize(("error", "offset_mm"), COMMON.values(), ids=[*COMMON])
+def test_what_all_panels_have_in_common_is_said(
+    error: Callable[[FloatArray], FloatArray], offset_mm: float, aligned: Callable[..., Any]
+) -> None:
+    """Errors of frame, scale and offset that no residual shows."""
+    found = aligned(of_mirror(error), "--offset-mm", str(1e3 * OFFSET_M + offset_mm))
+    said = [line for line in found["warnings"] if "the panels have in common" in line]
+    middles = 1e3 * np.array([M1.world_from_deck(body.origin) for body in M1.panels.values()])
+    normals = np.array([M1.rotate_world_from_deck(body.axes[2]) for body in M1.panels.values()])
+    expected_mm = float(np.sqrt(np.mean((np.sum(error(middles) * normals, axis=1) - offset_mm) ** 2)))
+    if not expected_mm:
+        assert said == []
+        return
+    (line,) = said
+    # The panels lie anyhow, by 0.05 mm rms: a tenth of that is common by chance.
+    assert float(line.split("in common ")[1].split(" mm")[0]) == pytest.approx(expected_mm, abs=0.03)
+
+
+def test_points_of_two_frames_on_every_panel_are_no_outliers(aligned: Callable[..., Any]) -> None:
+    """Every second target by another instrument: the middle one and the corners of each panel are 0.2 mm higher."""
+    points = places() + np.where(np.arange(27) % 2 == 0, 0.2, 0.0)[:, None] * [0.0, 0.0, 1.0]
+    found = aligned(rows(points, labels()))
+    assert not any(panel["outliers"] for panel in found["panels"])
+    assert found["instrument"]["sigma_factor"] > 4.0
+    assert is_recovered(found, 4.0)
 
 
 def test_good_readings_keep_their_sigmas(aligned: Callable[..., Any]) -> None:

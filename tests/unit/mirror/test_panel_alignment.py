@@ -30,10 +30,13 @@ from ccatp.mirror.panel_alignment import (
     cos_incidence,
     deviations_of,
     explain,
+    fit_bent,
     fit_modes,
     fit_panels,
     gram,
+    half_size_m,
     mirror_wavefront,
+    panel_result,
     prices,
     quadratic,
     rigid,
@@ -255,6 +258,66 @@ def test_a_bent_panel_keeps_its_points() -> None:
         assert best.is_kept.all()
 
 
+HALF_M = 0.335, 0.375
+
+
+@pytest.mark.parametrize("modes", [rigid, adjustable])
+def test_the_plane_of_a_bent_panel_does_not_depend_on_the_points_that_show_it(modes: Modes) -> None:
+    """Its points without noise; nine of them, or seven: the plane is that of the whole area."""
+    every = on_grid(BENT)
+    fits = []
+    for left_out in ((), *combinations(range(9), 2)):
+        is_kept = np.ones(9, dtype=np.bool_)
+        is_kept[list(left_out)] = False
+        if (fit := fit_bent(every, is_kept, modes, HALF_M)) is not None:
+            fits.append(fit.values)
+    assert len(fits) > 25
+    assert np.ptp(np.array(fits), axis=0) == pytest.approx(np.zeros(fits[0].size), abs=1e-12)
+    # Independent: least squares over a dense grid of the area.
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, 201) * HALF_M[0], np.linspace(-1.0, 1.0, 201) * HALF_M[1])
+    dense = np.column_stack([x.ravel(), y.ravel()])
+    coefficients = np.linalg.lstsq(quadratic(GRID_M), BENT, rcond=None)[0]
+    expected = np.linalg.lstsq(modes(dense), quadratic(dense) @ coefficients, rcond=None)[0]
+    # The grid has its outer points on the rim: 1 % more than the area.
+    assert fits[0] == pytest.approx(expected, rel=0.02, abs=1e-7)
+
+
+def test_the_covariance_and_the_residuals_of_a_bent_panel_are_as_stated() -> None:
+    rng = np.random.default_rng(12)
+    is_kept = np.arange(9) != 2
+    exact = fit_bent(on_grid(BENT), is_kept, rigid, HALF_M)
+    assert exact is not None
+    distances, residuals = [], []
+    for _ in range(300):
+        fit = fit_bent(on_grid(BENT + noise(rng)), is_kept, rigid, HALF_M)
+        assert fit is not None
+        error = fit.values - exact.values
+        distances.append(error @ np.linalg.solve(fit.covariance, error))
+        residuals.append(np.mean((fit.residuals_m - exact.residuals_m) ** 2))
+    # Sum of 300 chi-squares of three degrees of freedom: variance 2 x 3 x 300; four sigmas.
+    assert sum(distances) == pytest.approx(900.0, abs=4.0 * 1800**0.5)
+    assert np.mean(residuals) == pytest.approx(exact.residual_variance_m2, rel=0.15)
+
+
+@pytest.mark.parametrize("error_m", [50e-6, -200e-6])
+def test_a_wrong_point_of_a_bent_panel_does_not_move_it(error_m: float) -> None:
+    rng = np.random.default_rng(21)
+    truth = fit_bent(on_grid(BENT), np.ones(9, dtype=np.bool_), rigid, half_size_m(M1.panel(TILTED)))
+    assert truth is not None
+    places = adjuster_places(M1, TILTED)[1]
+    pulls = []
+    for k in [*range(9)] * 4:
+        values = BENT + noise(rng)
+        values[k] += error_m
+        panel = panel_result(M1, TILTED, on_grid(values), PRICE, 1.0)
+        assert panel is not None
+        assert [point.point - 1 for point in panel.outliers] == [k]
+        error = rigid(places) @ (panel.fit.values - truth.values)
+        pulls.append(np.max(np.abs(error) / panel.rigid.moves.sigma_m))
+    # The largest of five moves of 36 panels.
+    assert max(pulls) < 4.0
+
+
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_few_points_accuse_nobody(count: int) -> None:
     # With so few, leaving any one of several points out explains the contradiction as well.
@@ -408,11 +471,52 @@ def test_contradictions_beyond_outliers_are_reported() -> None:
     rng = np.random.default_rng(4)
     measured = [shifted(one, float(rng.normal()) * 60e-6) for one in exact()]
     result = result_of(measured)
-    assert any("contradict each other by more than they are uncertain" in line for line in result.warnings)
+    (line,) = result.warnings
+    assert "the points scatter about the panels" in line
+    assert result.sigma_factor == pytest.approx(30.0, rel=0.5)
     # A floor that says so makes them agree.
     result = result_of(measured, CFG.align.model_copy(update={"point_floor_m": 60e-6}))
     assert result.warnings == ()
     assert result.panels[0].fit.sigma[0] == pytest.approx(20e-6, rel=0.01)
+
+
+@pytest.mark.parametrize("rough_m", [20e-6, 28e-6])
+def test_points_that_scatter_more_than_they_are_uncertain_have_larger_sigmas(rough_m: float) -> None:
+    """Panels that are not smooth: no point of them is an outlier, and the moves are as uncertain as they are wrong."""
+    rng = np.random.default_rng(6)
+    truth = misaligned(CFG, M1.panels, rng)
+    measured = [
+        shifted(exact_fix(M1, point, lies), float(rng.normal()) * rough_m)
+        for panel, lies in truth.items()
+        for point in M1.point_ids(panel)
+    ]
+    result = survey_result(M1, CFG.align, HEIGHT_M, measured, truth)
+    (line,) = result.warnings
+    assert "the points scatter about the panels" in line
+    assert result.sigma_factor * 2e-6 == pytest.approx(rough_m, rel=0.25)
+    assert sum(len(panel.outliers) for panel in result.panels) == 0
+    found = compare(result.panels, injected(truth))
+    assert found is not None
+    assert found.chi2 / found.dof == pytest.approx(1.0, abs=0.45)  # as the factor, which is squared
+
+
+def test_one_rough_panel_of_many_has_larger_sigmas_alone() -> None:
+    rng = np.random.default_rng(8)
+    panels = [*M1.panels][:12]
+    measured = []
+    for panel in panels:
+        scale = 60e-6 if panel == panels[3] else 2e-6
+        measured += [
+            shifted(exact_fix(M1, point, PanelMisalignment(0.0, 0.0, 0.0)), float(rng.normal()) * scale)
+            for point in M1.point_ids(panel)
+        ]
+    result = survey_result(M1, CFG.align, HEIGHT_M, measured, panels)
+    assert result.sigma_factor == 1.0
+    (line,) = [one for one in result.warnings if "contradict each other by more than they are uncertain" in one]
+    assert line.startswith(f"panel {panels[3].row}/{panels[3].col}")
+    rough = result.panels[3]
+    assert f"are multiplied by {rough.sigma_factor:.1f}" in line
+    assert np.max(np.abs(rough.rigid.moves.values_m) / rough.rigid.moves.sigma_m) < 4.0
 
 
 @pytest.mark.parametrize(

@@ -51,9 +51,9 @@ def many_readings() -> str:
     return "\n".join(line for seed in range(20) for line in rows(places(seed=seed), NAMES))
 
 
-def of_observatory() -> list[str]:
+def of_observatory(form: str = "11{1}{0}1") -> list[str]:
     """Telescope, mirror, column, row, number."""
-    return ["11{1}{0}1".format(*name.split("/")) for name in NAMES]
+    return [form.format(*name.split("/")) for name in NAMES]
 
 
 # Name: content, arguments, and what the line says; nothing if the panels are right.
@@ -87,6 +87,27 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
         "Group,Name,Z,Y,X,Time\n"
         + "\n".join(f"A,{n},{z},{y},{x},12:00:01" for n, (x, y, z) in zip(NAMES, POINTS.tolist(), strict=True)),
         SIGMA, RIGHT,
+    ),
+    "Polyline of a tracker": (
+        "Enabled\tFeature     \tID\tx         \ty       \tz       \ti\tj\tk\tDev From Fit\tProbe\n"
+        + "".join(
+            f"Checked\tPolyline 3X3\t{k + 1} \t{x:,.3f}\t{y:,.3f} \t{z:,.3f}\t \t \t \t0.000       \t3    \n"
+            for k, (x, y, z) in enumerate(POINTS.tolist())
+        ),
+        SIGMA, RIGHT,
+    ),
+    "a point that the operator has excluded": (
+        "Enabled,ID,x,y,z\n"
+        + "\n".join(f"{'Unchecked' if k == 4 else 'Checked'},{row}" for k, row in enumerate(rows(POINTS, NAMES))),
+        SIGMA, "is marked 'Unchecked'",
+    ),
+    "eight columns of photogrammetry, the last 0": (with_sigmas("0.015", "0.015", "0.015", "0.000"), (), RIGHT),
+    "eight columns, the last no 0": (with_sigmas("0.015", "0.015", "0.015", "0.100"), (), "of more columns a first"),
+    "collection, group and target": (
+        "\n".join(f"A,Panels,{row}" for row in rows(POINTS, NAMES)), SIGMA, "of more columns a first line",
+    ),
+    "collection, group and target, named": (
+        "collection,group,target,x,y,z\n" + "\n".join(f"A,Panels,{row}" for row in rows(POINTS, NAMES)), SIGMA, RIGHT,
     ),
     "coordinates in mm, sigmas in um": (
         with_sigmas("15", "15", "15", head="label,x_mm,y_mm,z_mm,sx_um,sy_um,sz_um\n"), (), RIGHT,
@@ -141,6 +162,9 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
     "offset of another ball": (table(","), (*SIGMA, "--offset-mm", "6.35"), "give --offset-mm"),
     # Panels.
     "names of the observatory": (renamed(of_observatory()), SIGMA, RIGHT),
+    "names of the observatory, row first": (renamed(of_observatory("11{0}{1}1")), SIGMA, RIGHT),
+    "names with the site": (renamed(of_observatory("01-011{0}{1}1 V1")), SIGMA, RIGHT),
+    "numbers that are no names": (renamed([str(11001 + k) for k in range(27)]), SIGMA, RIGHT),
     "names of the other mirror": (
         renamed(["12" + name[2:] for name in of_observatory()]), SIGMA, "is of mirror 2",
     ),
