@@ -96,7 +96,7 @@ def differences(cfg: CommonConfig, other: CommonConfig | None = None) -> list[tu
         kind = kind_of(cfg)
         shipped: Callable[[Any], CommonConfig] | None = None if kind.shipped is None else kind.shipped.get()
         other = load_mission(None, {"system": cfg.system}) if shipped is None else shipped(cfg)
-    before, after = dict(_leaves(other.model_dump(mode="json"))), dict(_leaves(cfg.model_dump(mode="json")))
+    before, after = dict(leaves(other.model_dump(mode="json"))), dict(leaves(cfg.model_dump(mode="json")))
     keys = dict.fromkeys((*before, *after))
     return [(key, before.get(key), after.get(key)) for key in keys if before.get(key) != after.get(key)]
 
@@ -106,7 +106,7 @@ def keys_without_effect(cfg: Config, _is_sim: bool) -> list[str]:
     unused, filters = ("full_state", "ekf and ukf") if cfg.run.filter in FOUR_STATE else ("four_state", "kf")
     shipped = load_config().localizer.model_dump(mode="json")[unused]
     own = cfg.localizer.model_dump(mode="json")[unused]
-    changed = dict(_leaves(own)).items() - dict(_leaves(shipped)).items()
+    changed = dict(leaves(own)).items() - dict(leaves(shipped)).items()
     return [
         f"localizer.{unused}.{key} = {format_value(value)} has no effect with run.filter = {cfg.run.filter}; it is for "
         f"{filters}"
@@ -114,9 +114,10 @@ def keys_without_effect(cfg: Config, _is_sim: bool) -> list[str]:
     ]
 
 
-def _leaves(tree: Mapping[str, Any], at: str = "") -> Iterator[tuple[str, object]]:
+def leaves(tree: Mapping[str, Any], at: str = "") -> Iterator[tuple[str, object]]:
+    """Dotted key and value of each leaf of a tree."""
     for name, value in tree.items():
         if isinstance(value, Mapping):
-            yield from _leaves(value, f"{at}{name}.")
+            yield from leaves(value, f"{at}{name}.")
         else:
             yield at + name, value

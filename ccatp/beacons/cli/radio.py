@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,6 +56,12 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
     metavar="NAME",
     help="Only radio of the vehicle that is used; by default all whose place is given.",
 )
+@click.option(
+    "--moving",
+    multiple=True,
+    metavar="NAME",
+    help="Beacon that moves, by filter.beacon_walk_m_sqrt_s. May be repeated.",
+)
 @click.option("--topics", "topics_file", type=common.PATH, help="TOML file that names the topics of a ROS bag.")
 @common.figure_option("Draw map, path and residuals")
 @click.option(
@@ -75,14 +82,15 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
     settings: Mapping[str, object], keep_heading: bool, map_file: Path | None, start: str | None,
-    tag: str, topics_file: Path | None, figure_file: Path | None, tum_file: Path | None, out_dir: Path | None,
-    peers: bool, json_output: bool,
+    moving: tuple[str, ...], tag: str, topics_file: Path | None, figure_file: Path | None, tum_file: Path | None,
+    out_dir: Path | None, peers: bool, json_output: bool,
 ) -> None:  # fmt: skip
     """Map the beacons of a recorded run and find the vehicle's path on that map, or on a known one.
 
     PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, a CSV of events, tables with headers, a factor
     graph (pyfg), or a ROS bag (docs/radio_data.md).
     """
+    from ccatp.beacons.config.effects import recording_keys_without_effect
     from ccatp.beacons.config.load import load_recordings_config
     from ccatp.beacons.datasets.reader import read_run
     from ccatp.beacons.estimation.evaluation import judge, result_data, table_lines
@@ -91,10 +99,13 @@ def slam(
     from ccatp.studies.results import markdown_table
 
     assumed = load_recordings_config(config_file, settings)
-    known = _known(map_file, start)
+    known = _known(map_file, start)._replace(moving=moving)
     run = read_run(path, data_format, robot, topics_file, tag=tag, turns_heading=not keep_heading, known=known)
     if known.map is not None and known.first_pose is None and run.truth is None:
         raise click.UsageError("--map: the run has no truth of its first pose; give it with --start X,Y,HEADING")
+    shipped = load_recordings_config()
+    unused = recording_keys_without_effect(assumed, shipped, run.kind, filter_name, moves=bool(moving))
+    run = replace(run, warnings=(*unused, *run.warnings))
     common.warn(run.warnings)
     track = estimate(run, assumed, filter_name)
     common.warn(track.warnings)

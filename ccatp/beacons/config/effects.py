@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-from ccatp.beacons.config.models import RadioConfig
-from ccatp.config.describe import differences
+from ccatp.beacons.config.models import RadioConfig, RecordingsConfig
+from ccatp.config.describe import differences, leaves
 from ccatp.config.messages import format_value
 
 
@@ -130,6 +130,41 @@ UNUSED = (
         "with sim.target.motion = waypoints",
     ),
 )  # fmt: skip
+
+
+FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
+# Of a recorded run: keys that an estimator does not use, with FORMAT for the section of the recording.
+UNUSED_BY = {
+    "ekf-slam": (
+        "FORMAT.priors.turn_per_m", "FORMAT.priors.bearing_offset_rad", "FORMAT.priors.beacon_offset_m",
+        "FORMAT.priors.core", "FORMAT.radio.freedom", "fixed_lag",
+    ),
+    "smoother": ("FORMAT.priors.core", "fixed_lag"),
+    "fixed-lag": (),
+}  # fmt: skip
+
+
+def recording_keys_without_effect(
+    cfg: RecordingsConfig, shipped: RecordingsConfig, kind: str, estimator: str, *, moves: bool = False
+) -> list[str]:
+    """A line for each key that differs from the shipped ones and does nothing with an estimator on a recorded run.
+
+    ``kind``: section of the recording's format. ``moves``: whether a beacon of it moves.
+    """
+    others = tuple(name for name in FORMATS if name != kind)
+    unused = [key.replace("FORMAT", kind) for key in UNUSED_BY[estimator]]
+    before, found = dict(leaves(shipped.model_dump(mode="json"))), []
+    for key, value in leaves(cfg.model_dump(mode="json")):
+        if value == before[key]:
+            continue
+        if key.startswith(tuple(f"{name}." for name in others)):
+            why = f"the settings of this recording are those of {kind}"
+            found.append(f"{key} = {format_value(value)} has no effect: {why}")
+        elif key == "filter.beacon_walk_m_sqrt_s" and not moves:
+            found.append(f"{key} = {format_value(value)} has no effect without --moving")
+        elif any(key == one or key.startswith(f"{one}.") for one in unused):
+            found.append(f"{key} = {format_value(value)} has no effect with --filter {estimator}")
+    return found
 
 
 def keys_without_effect(cfg: RadioConfig, is_sim: bool) -> list[str]:

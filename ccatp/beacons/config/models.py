@@ -545,6 +545,7 @@ class SlamFilterConfig(Model):
     learn_prior: Positive
     doubt_pose_after: Annotated[int, Field(ge=1)]
     doubt_beacon_after: Annotated[int, Field(ge=1)]
+    beacon_walk_m_sqrt_s: Positive
     jump_m: Positive
     jump_rad: Positive
     transports: bool

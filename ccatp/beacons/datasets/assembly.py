@@ -62,6 +62,10 @@ def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) 
     _check_steps(odometry)
     steps = bridged(Steps(odometry.values[:, 0], *(odometry.values[1:, column] for column in (1, 2, 3))))
     readings, beacon_ids = _readings(recording, tables, steps, warnings)
+    if unheard := [name for name in known.moving if name not in beacon_ids]:
+        raise RadioDataError(
+            file, f"has no reading of beacon {unheard[0]}, which is to move; there are {listed(beacon_ids)}"
+        )
     truth = _truth(truth_rows, steps, warnings, turns_heading)
     first_pose = known.first_pose or pose_of_truth(truth, steps, warnings)
     if truth is not None and len(truth.times_s) < LEAST_TRUTH:
@@ -74,7 +78,7 @@ def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) 
     known_map = None
     if known.map is not None:
         heights_m |= _heights(known.map)
-        known_map = _of_beacons(known.map, beacon_ids, recording, warnings)
+        known_map = _of_beacons(known.map, beacon_ids, known.moving, recording, warnings)
     places = list(radios.tags_m.values()) or [radios.antenna_m]
     z_m = np.array([heights_m.get(beacon, np.nan) for beacon in beacon_ids])
     above_m = np.array([np.nan_to_num(z_m - up_m) for *_, up_m in places])
@@ -97,7 +101,7 @@ def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) 
         )
     run = RecordedRun(
         recording.name, recording.kind, steps, readings, beacon_ids, places_m, truth, first_pose, (),
-        (ahead_m, left_m), known_map, tags,
+        (ahead_m, left_m), known_map, tags, known.moving,
     )  # fmt: skip
     # A row with two readings gives the same warning of each.
     return replace(run, warnings=tuple(dict.fromkeys((*warnings, *suspicions(run)))))
@@ -295,10 +299,11 @@ def _heights(known_map: KnownMap) -> dict[str, float]:
 
 
 def _of_beacons(
-    known_map: KnownMap, beacon_ids: tuple[str, ...], recording: Recording, warnings: list[str]
-) -> KnownMap:
-    """The part of the map that has the beacons of the readings."""
-    here = known_map.of(beacon_ids)
+    known_map: KnownMap, beacon_ids: tuple[str, ...], moving: tuple[str, ...], recording: Recording,
+    warnings: list[str],
+) -> KnownMap:  # fmt: skip
+    """The part of the map that has the beacons of the readings, but for those that move."""
+    here = known_map.of([name for name in beacon_ids if name not in moving])
     if not here.names:
         raise RadioDataError(
             recording.file,

@@ -58,6 +58,8 @@ def _started(run: RecordedRun, settings: RecordingConfig, found: Followed, times
             mean, doubtful[k] = waiting.candidates[0].mean, True
         else:
             continue
+        if name in run.moving:
+            continue
         beacons[k, :2], used[k] = mean[:2], True
         if mean.size > 2 and priors.rssi_reference_db > 0.0:
             levels_db.append(mean[2] - settings.radio.rssi_reference_dbm)

@@ -122,6 +122,8 @@ class MapEntry:
     radios: dict[Radio | None, RadioErrors] = field(default_factory=dict)
     refused: int = 0  # readings refused in a row
     on_trial: int = 0  # number of readings that must still agree with the first one; 0: the trial is over
+    walked_s: float = 0.0  # time to which the place of a beacon that moves was predicted
+    used_s: float = 0.0  # time of the last reading that was used
 
     def heard_by(self, radio: Radio | None) -> RadioErrors:
         """The errors of the readings of a radio."""
@@ -179,6 +181,14 @@ class BeaconMap(dict[BeaconId, MapEntry]):
             heard.fresh = 1.0 - phi * phi
             self._engine.relax(heard.wander, phi, heard.fresh)
         heard.way_m, heard.time_s = way_m, time_s
+
+    def walk_to(self, beacon: BeaconId, walk_m2_s: float, time_s: float) -> None:
+        """Predict the place of a beacon that moves: a random walk whose variance grows by ``walk_m2_s``."""
+        entry, place = self[beacon], self._engine.block(beacon).start
+        added = walk_m2_s * max(time_s - entry.walked_s, 0.0)
+        for column in (place, place + 1):
+            self._engine.relax(column, 1.0, added)
+        entry.walked_s = max(time_s, entry.walked_s)
 
     def _append(self, block: object, mean: FloatArray, covariance: FloatArray) -> None:
         b = mean.size

@@ -92,6 +92,8 @@ class BeaconSlam:
         levels: factor on the configured noise variance of each sensor and of the motion.
         unplaced: number of readings with a bearing alone of a beacon that was not on the map: they are not used.
         moved: beacons that were removed to be placed again, each with the time_s of the reading that caused it.
+        left: the same beacons, each with the time_s of the last reading that was used, and the estimate then.
+        walks_m2_s: beacons that move at random, each with the variance that its place gains in a second.
     """
 
     flat = 100.0  # standard deviation of a beacon's place before its readings, relative to its distance
@@ -132,6 +134,8 @@ class BeaconSlam:
         self._gate, self._knee, self._iterations = gate, how.knee_sigmas, iterations
         self._refused, self.jumps, self.unplaced = 0, 0, 0
         self.moved: list[tuple[BeaconId, float]] = []
+        self.left: list[tuple[BeaconId, float, BeaconEstimate]] = []
+        self.walks_m2_s: dict[BeaconId, float] = {}
         self._way_m = 0.0
         self.waiting: dict[BeaconId, PendingLandmark] = {}
         self.learned: list[BeaconInnovation] = []
@@ -329,7 +333,8 @@ class BeaconSlam:
             row.variance *= self.levels[kind].factor
             return row
 
-        return StackedRows(self.engine, waiting.records, self._shared, row_of)
+        walk_m2_s = self.walks_m2_s.get(waiting.beacon, 0.0)
+        return StackedRows(self.engine, waiting.records, self._shared, row_of, walk_m2_s)
 
     def _join(self, waiting: PendingLandmark, found: Candidate) -> None:
         """Add a beacon to the map: an iterated update of the whole state with all of its waiting readings."""
@@ -346,6 +351,8 @@ class BeaconSlam:
         start[block] = found.mean
         columns = columns_of(rows.columns.tolist(), block)
         engine.update_iterated(columns, linearise, found.variances, self.linearisations, start=start)
+        entry = self._map[waiting.beacon]
+        entry.walked_s = entry.used_s = waiting.records[-1].reading.time_s
         waiting.drop(engine)
         del self.waiting[waiting.beacon]
         self._map.renumber()
@@ -357,6 +364,8 @@ class BeaconSlam:
 
     def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
         """Process the bearing first; if it is refused, the rest of the reading is refused, too."""
+        if reading.beacon in self.walks_m2_s:
+            self._map.walk_to(reading.beacon, self.walks_m2_s[reading.beacon], reading.time_s)
         heard = entry.heard_by(reading.radio)
         bias = self._wander if heard.noise is None else heard.noise.bias
         if bias is not None and (bias.share > 0.0 or heard.wander >= 0) and not is_direction(reading):
@@ -368,6 +377,8 @@ class BeaconSlam:
                 nis, spread, size, accepted = nis + found.nis, spread * found.spread, size + 1, found.accepted
         if self._learns:
             self._fresh.clear()
+        if accepted:
+            entry.used_s = reading.time_s
         self._judge(reading, entry, accepted=accepted)
         return BeaconInnovation(reading.beacon, nis, size, accepted, nis + log(spread), reading.radio)
 
@@ -435,6 +446,7 @@ class BeaconSlam:
             self.engine.predict(self.engine.mean[:v].copy(), np.eye(v), np.diag(jump**2))
             self.jumps += 1
         if entry.refused >= self._how.doubt_beacon_after:
+            self.left.append((reading.beacon, entry.used_s, self.beacons[reading.beacon]))
             self._map.leave(reading.beacon)
             self.moved.append((reading.beacon, reading.time_s))
 

@@ -17,6 +17,7 @@ from ccatp.beacons.estimation.motion import Increment
 from ccatp.beacons.estimation.recording import (
     BeaconFix,
     BeaconId,
+    BeaconTrack,
     Calibrated,
     EstimatedPath,
     Reading,
@@ -148,6 +149,7 @@ def follow(
     search = HeadingRelocalizer(recorded_slam(assumed, how, run.first_pose, np.diag(np.square(sigmas))))
     if run.known_map is not None:
         search.best.know(run.known_map, _kinds(run))
+    search.best.walks_m2_s = dict.fromkeys(run.moving, how.beacon_walk_m_sqrt_s**2)
     times = np.union1d(_spaced(run.steps.times_s, finest_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), list(_readings(run, cfg.radio.camera_field_rad))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
@@ -165,6 +167,8 @@ def follow(
         if window is not None:
             window.step(float(times[k]), search.all, times[: k + 1], poses[: k + 1])
             poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
+        if run.moving and now:
+            log.track({reading.beacon for reading in now}, search.best, float(times[k]))
     delayed = None if window is None else window.delayed(search.best, times, poses, covariances)
     priors, noise = (cfg.priors, None) if window is None else (window.priors, window.noise)
     path = _result(run, search.best, log, priors)
@@ -183,7 +187,16 @@ class _Log:
     def __init__(self) -> None:
         self.learned, self.times_s = list[BeaconInnovation](), list[float]()
         self.predict_s = list[float]()
+        self.tracks = dict[str, list[tuple[float, FloatArray, FloatArray]]]()
         self.update_s, self.scalar_s = list[float](), list[float]()
+
+    def track(self, read: set[BeaconId], slam: BeaconSlam, time_s: float) -> None:
+        """Add the places of beacons that move, of those that were read."""
+        if read.isdisjoint(slam.walks_m2_s):
+            return
+        for name, fix in slam.beacons.items():
+            if name in read and name in slam.walks_m2_s:
+                self.tracks.setdefault(str(name), []).append((time_s, fix.mean[:2], fix.covariance[:2, :2]))
 
     def take(self, time_s: float, learned: Sequence[BeaconInnovation], count: int, lasted_s: float) -> None:
         """Add the innovations of the ``count`` readings of an instant, which took ``lasted_s``."""
@@ -206,7 +219,9 @@ def _result(run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig
         for name, found in slam.calibration.items()
         if found[1] < UNCHANGED * getattr(assumed, name)
     }
-    beacons, none = slam.beacons.items(), np.empty(0)
+    beacons, none = [(name, fix) for name, fix in slam.beacons.items() if name not in slam.walks_m2_s], np.empty(0)
+    for name, until_s, fix in slam.left:
+        log.tracks.setdefault(str(name), []).append((until_s, fix.mean[:2], fix.covariance[:2, :2]))
     at = columns_of(*((first := slam.engine.block(name).start, first + 1) for name, _ in beacons))
     return EstimatedPath(
         none, none, none,
@@ -227,6 +242,10 @@ def _result(run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig
             )
             for time_s, one in zip(log.times_s, log.learned, strict=True)
         ),
+        tracks={
+            name: BeaconTrack(*map(np.array, zip(*sorted(rows, key=lambda row: row[0]), strict=True)))
+            for name, rows in log.tracks.items()
+        },
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ccatp.beacons.estimation.recording import (
     BeaconFix,
+    BeaconTrack,
     EstimatedPath,
     RecordedRun,
     ReferencePath,
@@ -139,6 +140,7 @@ def result_data(run: RecordedRun, filter_name: str, track: EstimatedPath, judged
         "beacons": {name: [fix.x_m, fix.y_m] for name, fix in beacons.items()},
         "beacon_sigmas_m": {name: np.sqrt(np.diag(fix.covariance)).tolist() for name, fix in beacons.items()},
         "beacon_errors_m": dict(judged.beacon_errors_m),
+        "moving": {name: _where(one, judged.alignment) for name, one in track.tracks.items()},
         "range_scale": calibration["range_scale"][0] if "range_scale" in calibration else None,
         "range_offset_m": calibration["range_offset_m"][0] if "range_offset_m" in calibration else None,
         "calibration": {name: {"value": value, "sigma": sigma} for name, (value, sigma) in calibration.items()},
@@ -154,6 +156,11 @@ def result_data(run: RecordedRun, filter_name: str, track: EstimatedPath, judged
         "scalar_us_p50": _median_us(track.scalar_s),
         "warnings": [*run.warnings, *track.warnings],
     }
+
+
+def _where(one: BeaconTrack, alignment: RigidMotion) -> dict[str, list[Any]]:
+    sigmas_m = [np.sqrt(np.diag(alignment.turned(P))).tolist() for P in one.covariances_m2]
+    return {"time_s": one.times_s.tolist(), "at_m": alignment.moved(one.places_m).tolist(), "sigma_m": sigmas_m}
 
 
 def _delayed(run: RecordedRun, track: EstimatedPath) -> dict[str, float | None] | None:
@@ -199,6 +206,10 @@ def table_lines(run: RecordedRun, data: dict[str, Any]) -> list[str]:
         sx, sy = data["beacon_sigmas_m"][name]
         error = _number(data["beacon_errors_m"].get(name), "{:.3f}")
         lines.append(f"{name:<8} {x:9.3f} {y:9.3f} {sx:8.3f} {sy:8.3f} {error:>8}")
+    for name, one in data["moving"].items():
+        for k in dict.fromkeys((0, -1)) if len(one["time_s"]) > 1 else (0,):
+            (x, y), (sx, sy) = one["at_m"][k], one["sigma_m"][k]
+            lines.append(f"{name:<8} {x:9.3f} {y:9.3f} {sx:8.3f} {sy:8.3f}  at {one['time_s'][k]:.1f} s")
     return lines
 
 

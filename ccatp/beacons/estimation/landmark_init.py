@@ -82,15 +82,21 @@ class Candidate(NamedTuple):
 
 
 class StackedRows:
-    """All scalars of the waiting readings of one beacon, as functions of their poses and the calibration."""
+    """All scalars of the waiting readings of one beacon, as functions of their poses and the calibration.
 
-    def __init__(self, engine: EkfSlam, records: Sequence[ReadingRecord], shared: slice, row_of: RowOf) -> None:
+    ``walk_m2_s``: variance that the beacon's place gains in a second.
+    """
+
+    def __init__(
+        self, engine: EkfSlam, records: Sequence[ReadingRecord], shared: slice, row_of: RowOf, walk_m2_s: float = 0.0
+    ) -> None:
         self.blocks = [engine.block(record.place) for record in records]
         self.columns = columns_of(*self.blocks, shared)
         self._shared, self._row_of = shared, row_of
         starts = np.cumsum([0, *(block.stop - block.start for block in self.blocks)]).tolist()
+        # A beacon that moves was elsewhere at the earlier readings.
         self._scalars = [
-            (kind, z, block, start)
+            (kind, z, block, start, walk_m2_s * (records[-1].reading.time_s - record.reading.time_s))
             for record, block, start in zip(records, self.blocks, starts, strict=False)
             for kind, z in scalars_of(record.reading)
         ]
@@ -100,13 +106,13 @@ class StackedRows:
         """At a state x (n,): derivatives by ``columns`` (m, k) and by the beacon (m, b), z - h (m,), variances (m,)."""
         m, calibration, first = self.size, x[self._shared].tolist(), self._shared_start
         H, G, e, R = np.zeros((m, self.columns.size)), np.zeros((m, len(beacon))), np.zeros(m), np.zeros(m)
-        for i, (kind, z, block, start) in enumerate(self._scalars):
+        for i, (kind, z, block, start, moved_m2) in enumerate(self._scalars):
             pose: list[float] = x[block].tolist()
             size = len(pose)
             row = self._row_of(kind, [*pose, 0.0][:POSE], calibration, beacon)
             H[i, start : start + size] = row.pose[:size]
             H[i, first : first + len(row.calibration)] = row.calibration
-            G[i], R[i] = row.beacon, row.variance
+            G[i], R[i] = row.beacon, row.variance + moved_m2 * (row.beacon[0] ** 2 + row.beacon[1] ** 2)
             e[i] = wrap_pi(z - row.expected) if kind == "bearing" else z - row.expected
         return H, G, e, R
 

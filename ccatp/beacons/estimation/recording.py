@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import nan
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -112,6 +113,7 @@ class Known(NamedTuple):
 
     map: KnownMap | None = None
     first_pose: tuple[float, float, float] | None = None  # of the vehicle: x_m, y_m, heading_rad
+    moving: tuple[str, ...] = ()  # beacons that move
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +138,8 @@ class RecordedRun:
     antenna_m: tuple[float, float] = (0.0, 0.0)  # ahead and left of the vehicle's origin; poses are the antenna's
     known_map: KnownMap | None = None
     tags: tuple[Radio, ...] = ()  # the vehicle's radios, if the readings are of several: poses are the origin's then
+
+    moving: tuple[str, ...] = ()  # of ``beacon_ids``: those that move
 
     @property
     def radios(self) -> Sequence[Radio | None]:
@@ -207,6 +211,14 @@ class ReadingInnovation(NamedTuple):
     tag: str = ""  # that read it, if there are several
 
 
+class BeaconTrack(NamedTuple):
+    """Where a beacon was, when it was read."""
+
+    times_s: FloatArray  # shape (n,), rising
+    places_m: FloatArray  # x_m, y_m, shape (n, 2)
+    covariances_m2: FloatArray  # shape (n, 2, 2)
+
+
 class EstimatedPath(NamedTuple):
     """An estimate of a run.
 
@@ -232,6 +244,8 @@ class EstimatedPath(NamedTuple):
     delayed: DelayedPath | None = None
     map_covariance: FloatArray = np.empty((0, 0))  # of all beacons' x_m, y_m in their order, shape (2 b, 2 b)
     innovations: tuple[ReadingInnovation, ...] = ()  # of all readings of beacons on the map; empty from a smoother
+    # Of beacons that move, which are not in ``beacons``, and of those placed again: where each was until then.
+    tracks: Mapping[str, BeaconTrack] = MappingProxyType({})
 
     def poses_at(self, at_s: FloatArray) -> FloatArray:
         """Poses at other times, shape (m, 3), linear between two of its own."""

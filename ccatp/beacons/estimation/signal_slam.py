@@ -23,9 +23,9 @@ _ITERATIONS = 4
 _NEAREST_M = 0.02  # smallest distance, so that derivatives of the distance exist
 # The standard EKF: no robust weights, no learned noise, no check for jumps of the pose or moved radios.
 _PLAIN = SlamFilterConfig(
-    knee_sigmas=1e3, learn_memory=0.0, learn_prior=1.0, doubt_pose_after=10**9, doubt_beacon_after=10**9, jump_m=1.0,
-    jump_rad=1.0, transports=False, wander_share=0.0, wander_length_m=1.0, rest_speed_m_s=0.0, rest_turn_rad_s=0.0,
-    turn_bias_walk_rad_s_sqrt_s=0.0,
+    knee_sigmas=1e3, learn_memory=0.0, learn_prior=1.0, doubt_pose_after=10**9, doubt_beacon_after=10**9,
+    beacon_walk_m_sqrt_s=1.0, jump_m=1.0, jump_rad=1.0, transports=False, wander_share=0.0, wander_length_m=1.0,
+    rest_speed_m_s=0.0, rest_turn_rad_s=0.0, turn_bias_walk_rad_s_sqrt_s=0.0,
 )  # fmt: skip
 _APART_RAD = pi / 2.0  # strongest readings further apart than this are two directions, not one
 

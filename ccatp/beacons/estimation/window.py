@@ -78,7 +78,9 @@ class Window:
     def __init__(self, run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, lag: FixedLagConfig) -> None:
         self._run, self._lag, self._spacing_s = run, lag, lag.lag_s / lag.poses
         self._rest = how.rest_speed_m_s, how.rest_turn_rad_s
-        self._readings = run.readings.with_distances(cfg.radio.camera_field_rad)
+        self._stands = np.array([name not in run.moving for name in run.beacon_ids])  # others are the filter's alone
+        readings = run.readings.with_distances(cfg.radio.camera_field_rad)
+        self._readings = readings.where(self._stands[readings.beacon])
         steps_s = run.steps.times_s
         _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
         self._grid_s = steps_s[first]
@@ -106,18 +108,18 @@ class Window:
             return
         if time_s < self._solved_s + SOONEST_S:
             return
-        placed = frozenset(map(str, slam.beacons))
-        joins = not placed <= self._placed or bool(slam.likely())
+        placed = frozenset(map(str, slam.beacons)) - {*self._run.moving}
+        joins = not placed <= self._placed or bool(slam.likely().keys() - {*self._run.moving})
         self._solved_s = time_s if joins or not placed else self._solved_s
         if joins or (placed and time_s >= self._due_s):
             self.solve(time_s, slam, times_s, poses)
-            self._placed = frozenset(map(str, slam.beacons))
+            self._placed = frozenset(map(str, slam.beacons)) - {*self._run.moving}
 
     def solve(self, time_s: float, slam: BeaconSlam, times_s: FloatArray, poses: FloatArray) -> None:
         """Solve the window, and correct the filter."""
         self._solved_s = time_s
         self._due_s = time_s + max(SOONEST_S, GROWTH * (time_s - self._begin_s))
-        likely = slam.likely()
+        likely = {name: place_m for name, place_m in slam.likely().items() if name not in self._run.moving}
         solved = self._solution(time_s, slam, likely, times_s, poses)
         if solved is None:
             return
@@ -190,7 +192,7 @@ class Window:
         self, time_s: float, slam: BeaconSlam, likely: Mapping[BeaconId, FloatArray], times_s: FloatArray,
         poses: FloatArray,
     ) -> _Solved | None:  # fmt: skip
-        used = np.array([name in slam.beacons or name in likely for name in self._run.beacon_ids])
+        used = self._stands & [name in slam.beacons or name in likely for name in self._run.beacon_ids]
         if self._marginal is not None:
             used |= self._marginal.known
         problem = self._problem(self._begin_s, time_s, used, from_begin=self._marginal is None)
@@ -228,7 +230,7 @@ class Window:
         whole[np.ix_(free, free)] = solved.factored.covariance_at(-1)
         names = [name for name in slam.calibration if solved.problem.free[SHARED.index(name)]]
         rows = [*range(POSE), *(POSE + SHARED.index(name) for name in names)]
-        placed = [k for k, name in enumerate(self._run.beacon_ids) if name in slam.beacons]
+        placed = [k for k, name in enumerate(self._run.beacon_ids) if self._stands[k] and name in slam.beacons]
         for k in placed:
             start = POSE + len(SHARED) + BEACON * k
             rows += (start, start + 1)
@@ -273,7 +275,7 @@ class Window:
     def _restart(self, time_s: float, slam: BeaconSlam) -> None:
         """Begin a window now, with the filter's estimate as its prior."""
         self._hand_over(np.inf)
-        used = np.array([name in slam.beacons for name in self._run.beacon_ids])
+        used = self._stands & [name in slam.beacons for name in self._run.beacon_ids]
         names, placed = list(slam.calibration), np.flatnonzero(used).tolist()
         shared, beacons = np.zeros(len(SHARED)), np.zeros((len(used), BEACON))
         rows = [*range(POSE), *(POSE + SHARED.index(name) for name in names)]

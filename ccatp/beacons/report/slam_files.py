@@ -19,13 +19,15 @@ PATH = ("time_s", "x_m", "y_m", "heading_rad", "xx_m2", "xy_m2", "xh_m_rad", "yy
 READINGS = (
     "time_s", "beacon", "tag", "range_m", "bearing_rad", "rssi_dbm", "residual_m", "nis", "nis_size", "is_used",
 )  # fmt: skip
+MOVING = ("time_s", "beacon", "x_m", "y_m", "xx_m2", "xy_m2", "yy_m2")
 FRAME = "of the first pose: that of the truth, or the origin"
 
 
 def write_slam(folder: Path, run: RecordedRun, track: EstimatedPath, assumed: RecordingConfig) -> None:
     """Write ``path.csv``, ``map.toml`` with the joint covariance, ``readings.csv`` and, for one radio, ``graph.pyfg``.
 
-    A path of a fixed-lag smoother is in ``path_delayed.csv``, too. Raises RadioDataError: they cannot be written.
+    A path of a fixed-lag smoother is in ``path_delayed.csv``, too; ``moving.csv`` has beacons that moved, if any.
+    Raises RadioDataError: they cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -33,6 +35,8 @@ def write_slam(folder: Path, run: RecordedRun, track: EstimatedPath, assumed: Re
         if (late := track.delayed) is not None:
             _write(folder / "path_delayed.csv", PATH, _path_rows(late.times_s, late.poses, late.covariances))
         _write(folder / "readings.csv", READINGS, _reading_rows(run, track, assumed.radio.camera_field_rad))
+        if track.tracks:
+            _write(folder / "moving.csv", MOVING, _track_rows(track))
         if not run.tags:  # the format has no places of radios on the vehicle
             times_s = run.steps.times_s
             true = np.full((len(times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, times_s)
@@ -55,6 +59,12 @@ def _path_rows(times_s: FloatArray, poses: FloatArray, covariances: FloatArray) 
     upper = covariances[:, *np.triu_indices(3)]
     rows: list[list[float]] = np.column_stack([times_s, poses, upper]).tolist()
     return rows
+
+
+def _track_rows(track: EstimatedPath) -> Iterable[list[object]]:
+    for name, (times_s, places_m, covariances_m2) in track.tracks.items():
+        for time_s, place_m, P in zip(times_s.tolist(), places_m.tolist(), covariances_m2, strict=True):
+            yield [time_s, name, *place_m, *P[np.triu_indices(2)].tolist()]
 
 
 def _reading_rows(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -> Iterable[list[object]]:

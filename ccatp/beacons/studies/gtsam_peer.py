@@ -64,6 +64,8 @@ def run_gtsam(
     gtsam = import_gtsam()
     if not np.isfinite(run.readings.range_m).all():
         raise PeerGaveUp(f"{run.name}: not all readings have a range, and GTSAM has no factor of signal strengths")
+    if run.moving:
+        raise PeerGaveUp(f"{run.name}: GTSAM has no stock factor of a beacon that moves")
     if run.tags and np.isfinite(run.readings.bearing_rad).any():
         raise PeerGaveUp(f"{run.name}: GTSAM has no factor of a bearing by one of several tags")
     try:

@@ -46,9 +46,15 @@ class EstimateError(CcatpError):
 def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> EstimatedPath:
     """Estimate a run by one of ``FILTERS``.
 
-    Raises EstimateError: the estimate is not finite, or the data do not determine it.
+    Raises EstimateError: the estimate is not finite, the data do not determine it, or the estimator has no model of
+    beacons that move.
     """
     cfg = getattr(assumed, run.kind)
+    if run.moving and filter_name == "smoother":
+        raise EstimateError(
+            f"{run.name}: the smoother has no model of beacons that move ({', '.join(run.moving)}); use ekf-slam or "
+            "fixed-lag"
+        )
     try:
         if filter_name == "smoother":
             track = smooth(run, cfg, assumed.filter, perf_counter)
@@ -85,7 +91,7 @@ def compared(
     """
     import_gtsam()  # fails before the computation
     tracks: list[tuple[str, EstimatedPath | None, float | None]] = [(RECKONING, reckoned_track(run), None)]
-    for name in FILTERS:
+    for name in FILTERS[:-1] if run.moving else FILTERS:  # the smoother has no model of beacons that move
         begin_s = perf_counter()
         tracks.append((name, estimate(run, assumed, name), perf_counter() - begin_s))
     try:

@@ -345,3 +345,46 @@ def test_a_peer_that_gives_up_leaves_the_table(tmp_path: Path, capsys: pytest.Ca
     assert [row[0] for row in rows if row[-1] == "True"] == ["GTSAM iSAM2", "GTSAM batch"]
     assert len(rows) == 6
     assert "warning: bearings: not all readings have a range" in err
+
+
+def test_beacons_that_move_are_named_and_written_with_their_times(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = reported(capsys, "slam", recording, "--moving", "8", "--filter", "ekf-slam", "--out", tmp_path, "--json")
+    assert "8" not in data["beacons"]
+    assert len(data["moving"]["8"]["time_s"]) == len(data["moving"]["8"]["at_m"]) > 50
+    rows = (tmp_path / "moving.csv").read_text().splitlines()
+    assert rows[0] == "time_s,beacon,x_m,y_m,xx_m2,xy_m2,yy_m2"
+    assert len(rows) == 1 + len(data["moving"]["8"]["time_s"])
+    status, _, error = said(capsys, "radio", "slam", recording, "--moving", "nine")
+    assert status == 2
+    assert "has no reading of beacon nine, which is to move; there are 6, 7, 8, 9" in error
+    status, _, error = said(capsys, "radio", "slam", recording, "--moving", "8", "--filter", "smoother")
+    assert status == 2
+    assert "the smoother has no model of beacons that move" in error
+
+
+def test_keys_without_effect_on_a_recording_are_named(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ("--set", "plaza.radio.range_sigma_m=0.3", "--set", "csv.priors.beacon_offset_m=0.2")
+    data = reported(capsys, "slam", recording, "--filter", "ekf-slam", *settings, "--json")
+    assert data["warnings"][:2] == [
+        "plaza.radio.range_sigma_m = 0.3 has no effect: the settings of this recording are those of csv",
+        "csv.priors.beacon_offset_m = 0.2 has no effect with --filter ekf-slam",
+    ]
+
+
+def test_two_tags_are_written_with_each_reading(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = [
+        f"{line},{'ab'[k // 2 % 2]}" if line.startswith(("range", "bearing")) else line
+        for k, line in enumerate(recording.read_text().splitlines())
+    ]
+    file = write_lines(tmp_path / "tags.csv", [*lines, "tag,a,0,0.001", "tag,b,0,-0.001"])
+    status, _, error = said(capsys, "radio", "slam", file, "--out", tmp_path / "out")
+    assert status == 0
+    assert "graph.pyfg is not written: the format has no places of several tags" in error
+    rows = (tmp_path / "out" / "readings.csv").read_text().splitlines()
+    assert rows[0].startswith("time_s,beacon,tag,")
+    assert {row.split(",")[2] for row in rows[1:]} == {"a", "b"}
+    assert not (tmp_path / "out" / "graph.pyfg").exists()

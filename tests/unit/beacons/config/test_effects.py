@@ -2,13 +2,16 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
-from ccatp.beacons.config.effects import UNUSED, keys_without_effect
-from ccatp.beacons.config.load import load_beacon_mission
+from ccatp.beacons.config.effects import UNUSED, UNUSED_BY, keys_without_effect, recording_keys_without_effect
+from ccatp.beacons.config.load import load_beacon_mission, load_recordings_config
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.studies.mote_navigation import BeaconSilWorld
+from ccatp.beacons.studies.recordings import estimate
 from tests.support.scenario import radio_config_of
+from tests.unit.beacons.datasets.sets import recorded, world
 
 MISSIONS: dict[str, dict[str, Any]] = {
     "zigbee": {},
@@ -89,3 +92,38 @@ def test_when_a_real_robot_scans_is_its_own_matter() -> None:
     cfg = radio_config_of("zigbee", observation__every_steps=20)
     line = "observation.every_steps = 20 has no effect on a real robot; it is for the simulated one"
     assert (keys_without_effect(cfg, is_sim=True), keys_without_effect(cfg, is_sim=False)) == ([], [line])
+
+
+def recording_changes(estimator: str) -> dict[str, Any]:
+    """Other values of the keys that an estimator does not use on a recording of the format ``csv``."""
+    changes: dict[str, Any] = {"plaza.priors.range_scale": 0.07, "filter.beacon_walk_m_sqrt_s": 0.3}
+    shipped = load_recordings_config().model_dump(mode="json")
+    for key in UNUSED_BY[estimator]:
+        node: Any = shipped
+        for part in (path := key.replace("FORMAT", "csv")).split("."):
+            node = node[part]
+        changes |= {leaf: other(value) for leaf, value in leaves(node, path).items()}
+    return changes
+
+
+@pytest.mark.parametrize("estimator", ["ekf-slam", "fixed-lag", "smoother"])
+def test_an_estimate_is_the_same_with_other_values_of_keys_without_effect(estimator: str) -> None:
+    shipped, changes = load_recordings_config(), recording_changes(estimator)
+    cfg, run = load_recordings_config(None, changes), recorded(world(1, 30.0))
+    named = recording_keys_without_effect(cfg, shipped, "csv", estimator)
+    assert {line.split(" = ")[0] for line in named} == changes.keys()
+    one, two = (estimate(run, each, estimator) for each in (shipped, cfg))
+    assert np.array_equal(one.poses, two.poses)
+    assert one.beacons.keys() == two.beacons.keys()
+
+
+@pytest.mark.parametrize("estimator", ["fixed-lag", "smoother"])
+@pytest.mark.parametrize("key", ["csv.priors.beacon_offset_m", "csv.priors.bearing_offset_rad", "csv.radio.freedom"])
+def test_keys_that_ekf_slam_does_not_use_act_on_the_other_estimators(key: str, estimator: str) -> None:
+    shipped, cfg = load_recordings_config(), load_recordings_config(None, {key: 2.0 if "freedom" in key else 0.2})
+    assert recording_keys_without_effect(cfg, shipped, "csv", estimator) == []
+    line = f"{key} = {2.0 if 'freedom' in key else 0.2} has no effect with --filter ekf-slam"
+    assert recording_keys_without_effect(cfg, shipped, "csv", "ekf-slam") == [line]
+    run = recorded(world(1, 30.0))
+    one, two = (estimate(run, each, estimator) for each in (shipped, cfg))
+    assert not np.array_equal(one.poses, two.poses)
