@@ -84,7 +84,7 @@ def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) 
     above_m = np.array([np.nan_to_num(z_m - up_m) for *_, up_m in places])
     readings = _in_the_plane(readings, above_m, warnings)
     if not len(readings.times_s):
-        raise RadioDataError(file, f"none of its readings can be used ({'; '.join(warnings[-3:])})")
+        raise RadioDataError(file, f"none of its readings can be used{_because(warnings)}")
     ahead_m, left_m, _ = radios.antenna_m
     tags = tuple(Radio(name, *place[:2]) for name, place in radios.tags_m.items())
     if tags:
@@ -246,9 +246,13 @@ def _check_names(recording: Recording, beacons: list[int]) -> None:
         )
 
 
+def _because(warnings: list[str]) -> str:
+    return f" ({'; '.join(warnings[-3:])})" if warnings else ""
+
+
 def _no_readings(times_s: list[float], steps: Steps, warnings: list[str]) -> str:
     if not times_s:
-        return f"none of its readings can be used ({'; '.join(warnings[-3:])})"
+        return f"none of its readings can be used{_because(warnings)}"
     return (
         f"no readings of beacons within the time of the odometry, {instant(steps.times_s[0])} to "
         f"{instant(steps.times_s[-1])}: theirs are {instant(min(times_s))} to {instant(max(times_s))}; "

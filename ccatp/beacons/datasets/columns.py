@@ -107,7 +107,7 @@ def read_columns(path: Path) -> Recording:
     there are several of one of the others.
     """
     folder = path if path.is_dir() else path.parent
-    texts = _texts(folder)
+    texts, unread = _texts(folder)
     readings = [file for file, text in texts.items() if is_columns(text)] if path.is_dir() else [path]
     if len(readings) != 1:
         raise RadioDataError(path, f"holds {len(readings)} tables of readings: name one")
@@ -121,7 +121,8 @@ def read_columns(path: Path) -> Recording:
     if len(odometry) != 1 or len(truths) > 1:
         what = f"{len(odometry)} tables of odometry and {len(truths)} of truth"
         raise RadioDataError(
-            folder, f"has {what} beside {file.name}: one with time and x, y, heading or speed, rate is needed"
+            folder,
+            f"has {what} beside {file.name}: one with time and x, y, heading or speed, rate is needed{unread}",
         )
     still = {other: one for other, one in others.items() if "time" not in one.quantities}
     mounts = {other: one for other, one in still.items() if "tag" in one.quantities}
@@ -176,14 +177,18 @@ def lacking(text: str) -> str:
     return f"its header ({listed(cells)}) has no column with {' or '.join(missing)}" if missing else ""
 
 
-def _texts(folder: Path) -> dict[Path, str]:
-    """The texts of a folder that may be tables, by file."""
-    texts = {}
+def _texts(folder: Path) -> tuple[dict[Path, str], str]:
+    """The texts of a folder that may be tables, by file, and those that are damaged, for a message."""
+    texts, damaged = {}, []
     for file in sorted(folder.iterdir()):
         if file.is_file() and {".csv", ".txt", ".tsv"} & {*file.suffixes}:
-            with suppress(NotTextError):
+            try:
                 texts[file] = read_text(file)
-    return texts
+            except NotTextError:
+                continue
+            except RadioDataError:
+                damaged.append(file.name)
+    return texts, f" ({listed(damaged)} cannot be read)" if damaged else ""
 
 
 def _first_line(text: str) -> tuple[int, str]:

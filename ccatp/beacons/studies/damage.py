@@ -279,7 +279,11 @@ def run_damage(job: Job) -> JobOutcome:
     """Run the estimator on one damaged window; its outcome is one of ``OUTCOMES``."""
     cfg, kind, case = job.cfg, str(job.factors["damage"]), job.seed % len(cases_of(job.cfg.run.data))
     estimator = str(job.factors["estimator"])
-    run, track, before = _undamaged(cfg.run.data, case, cfg, estimator)
+    try:
+        run, track, before = _undamaged(cfg.run.data, case, cfg, estimator)
+    except (RadioDataError, EstimateError) as error:  # nothing to compare with
+        name = " ".join(map(str, cases_of(cfg.run.data)[case]))
+        return JobOutcome({"case": name, "new": [str(error)], "outcome": "impossible", "unsurveyed": "impossible"})
     tables, truth = events_of(run, 0.0, WINDOW_S)
     middle_s = float(run.steps.times_s[0]) + 0.5 * min(WINDOW_S, span_s(run))
     rng = np.random.default_rng((job.seed, list(DAMAGES).index(kind)))

@@ -67,7 +67,8 @@ def found_in(folder: str) -> Found:
             one = _own_set(where, path)
         except (RadioDataError, OSError) as error:
             if path.is_dir() or {*RECORDINGS} & {*path.suffixes}:
-                left_out.append(str(error))
+                line = str(error)  # it may be of a file beside it
+                left_out.append(line if line.startswith(str(path)) else f"{path}: {line}")
             continue
         found[path.name if name_of(path) in found else name_of(path)] = one
     if not found:
@@ -85,7 +86,9 @@ def _own_set(where: Path, path: Path) -> RecordedSet:
     form = found_format(path)
     robots = tuple(robots_in(path if path.is_dir() else path.parent)) if form == "mrclam" else (None,)
     topics = path.with_name(f"{name_of(path)}.toml") if form == "bag" else None
-    one = RecordedSet(str(path.relative_to(where)), robots, str(topics) if topics and topics.is_file() else "")
+    if topics is not None and not topics.is_file():
+        raise RadioDataError(path, f"is a bag: name its topics in {topics.name} beside it").with_page()
+    one = RecordedSet(str(path.relative_to(where)), robots, str(topics) if topics else "")
     for robot in robots:
         _read(str(path), robot, one.topics)
     return one
@@ -132,9 +135,6 @@ def events_of(run: RecordedRun, begin_s: float, end_s: float) -> tuple[dict[str,
             tables[kind] = table(
                 readings.times_s[there], readings.beacon[there].astype(float), column[there], tag[there]
             )
-    if run.tags:  # ranges are in the plane already
-        places = [(k, tag.ahead_m, tag.left_m, 0.0) for k, tag in enumerate(run.tags)]
-        tables["tag"] = Table(Path(run.name), np.array(places), np.arange(1, len(places) + 1))
     truth = None if run.truth is None else ReferencePath(*table(*run.truth).values.T)
     return tables, truth
 
@@ -142,6 +142,9 @@ def events_of(run: RecordedRun, begin_s: float, end_s: float) -> tuple[dict[str,
 def read_again(run: RecordedRun, tables: Mapping[str, Table], truth: ReferencePath | None) -> RecordedRun:
     """A run from tables of events, as read and checked by the reader without the truth, which is added afterwards."""
     tags = tuple(tag.name for tag in run.tags)
+    if tags:  # ranges are in the plane already
+        places = np.array([(k, tag.ahead_m, tag.left_m, 0.0) for k, tag in enumerate(run.tags)])
+        tables = {**tables, "tag": Table(Path(run.name), places, np.arange(1, len(places) + 1))}
     again = checked_run(Recording(Path(run.name), run.name, run.kind, tables, run.beacon_ids, tags=tags))
     pose = pose_of_truth(truth, again.steps, [])
     return replace(again, first_pose=pose, truth=truth, beacon_truth_m=run.beacon_truth_m)

@@ -18,6 +18,7 @@ from ccatp.beacons.cricket.measured_map import map_measured
 from ccatp.beacons.datasets.doubts import map_doubts, stray_beacons, sudden_disagreement, survey_doubts
 from ccatp.beacons.datasets.mounting import radio_doubts
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
+from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
 from ccatp.beacons.estimation.causal import filter_run
 from ccatp.beacons.estimation.evaluation import RECKONING, judge, reckoned_track, result_data
@@ -137,30 +138,34 @@ def run_recordings(job: Job) -> JobOutcome:
         return _mapped_anchors(cfg, share, with_offset=ANCHOR_METHODS[estimator])
     if name == LEVELS:
         return _fixed_levels(Path(cfg.run.data) / "xbee_rssi/Scenario1", share, estimator)
-    rows = []
-    for robot in sets_in(cfg.run.data)[name].robots:
-        run = recorded_run(cfg.run.data, name, robot)
-        if share > 0.0:
-            span_s = float(run.steps.times_s[-1] - run.steps.times_s[0])
-            run = recorded_window(cfg.run.data, name, robot, share * span_s, span_s)
-        begin_s = perf_counter()
-        if estimator in FILTERS:
-            track, run_s = estimate(run, cfg, estimator), None
-        else:
-            try:
-                peers = run_gtsam(run, getattr(cfg, run.kind), perf_counter, cfg.run.peer_limit_s)
-                track = peers[PEERS.index(estimator)]
-            except PeerGaveUp:  # a mean over the other runs only could not be compared
-                return JobOutcome({"gave_up": True})
-        run_s = perf_counter() - begin_s
-        data = result_data(run, estimator, track, judge(track, run))
-        row = {key: data[value] for key, value in (_ERRORS | _SHOWN).items()}
-        late = data["delayed"] or dict.fromkeys(_DELAYED.values())
-        rows.append(row | {key: late[value] for key, value in _DELAYED.items()} | {"run_s": run_s})
+    try:
+        rows = [_on_robot(job, robot, share) for robot in sets_in(cfg.run.data)[name].robots]
+    except (PeerGaveUp, EstimateError, RadioDataError) as error:  # a mean over the others could not be compared
+        return JobOutcome({"gave_up": True, "why": str(error)})
     values = {key: [one[key] for one in rows] for key in rows[0]}
     if estimator not in FILTERS:
         values["nees"] = [None]  # covariances of the peers are not computed
     return JobOutcome({"robots": values, **{key: _mean(each) for key, each in values.items()}})
+
+
+def _on_robot(job: Job, robot: int | None, share: float) -> dict[str, float | None]:
+    """The errors of one robot of a set. Raises PeerGaveUp, EstimateError, RadioDataError: there is no estimate."""
+    cfg, name, estimator = job.cfg, str(job.factors["data"]), str(job.factors["estimator"])
+    run = recorded_run(cfg.run.data, name, robot)
+    if share > 0.0:
+        span_s = float(run.steps.times_s[-1] - run.steps.times_s[0])
+        run = recorded_window(cfg.run.data, name, robot, share * span_s, span_s)
+    begin_s = perf_counter()
+    if estimator in FILTERS:
+        track = estimate(run, cfg, estimator)
+    else:
+        peers = run_gtsam(run, getattr(cfg, run.kind), perf_counter, cfg.run.peer_limit_s)
+        track = peers[PEERS.index(estimator)]
+    run_s = perf_counter() - begin_s
+    data = result_data(run, estimator, track, judge(track, run))
+    late = data["delayed"] or dict.fromkeys(_DELAYED.values())
+    row: dict[str, float | None] = {key: data[value] for key, value in (_ERRORS | _SHOWN).items()}
+    return row | {key: late[value] for key, value in _DELAYED.items()} | {"run_s": run_s}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -215,6 +220,7 @@ def combine_recordings(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome
     """Values of the whole run, and median and 10 to 90 % of the errors over the later starts."""
     whole, later = dict(outcomes[0].values), [outcome.values for outcome in outcomes[1:]]
     whole["gave_up"] = sum("gave_up" in outcome.values for outcome in outcomes)
+    whole["why"] = list(dict.fromkeys(outcome.values["why"] for outcome in outcomes if "why" in outcome.values))
     for key in _ERRORS:
         known = [one[key] for one in later if one.get(key) is not None]
         ends = np.percentile(known, (10, 50, 90)).tolist() if known else [None] * 3
@@ -260,6 +266,7 @@ RECORDINGS = Study(
         path_m heading_rad beacons_m range_scale nis nees delayed_path_m delayed_nees covered gave_up update_us run_s
         started_path_m: p10 p50 p90
         started_beacons_m: p10 p50 p90
+        why
     """,
     draw=draw_recordings,
     mirrors=(),

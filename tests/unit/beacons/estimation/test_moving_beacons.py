@@ -40,7 +40,7 @@ def walk(seed: int) -> Callable[[FloatArray], FloatArray]:
 
 def kick(at_s: FloatArray) -> FloatArray:
     """Two metres to the right after a minute."""
-    return np.array(BEACONS[MOVED]) + np.outer(at_s > 0.5 * SECONDS, (2.0, 0.0))
+    return np.asarray(np.array(BEACONS[MOVED]) + np.outer(at_s > 0.5 * SECONDS, (2.0, 0.0)))
 
 
 def nees_of(track: EstimatedPath, place_at: Callable[[FloatArray], FloatArray]) -> float:

@@ -1,5 +1,6 @@
 """The studies of self-mapping and of recorded runs: published figures on few seeds, files, sizes, damages."""
 
+import gzip
 from math import hypot, log, sqrt, tau
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from ccatp.beacons.studies.gtsam_peer import PeerGaveUp
 from ccatp.beacons.studies.mote_navigation import combine as mote_navigation_combine
 from ccatp.beacons.studies.mote_runs import run_batch, run_filter, simulate_field, sure_rms_m
 from ccatp.beacons.studies.radio_bound import TrueStep, radio_bound
-from ccatp.beacons.studies.recorded_sets import RecordedSet, events_of, sets_in
+from ccatp.beacons.studies.recorded_sets import RecordedSet, events_of, read_again, recorded_run, sets_in
 from ccatp.beacons.studies.recordings import RECORDINGS, combine_recordings, estimate, run_recordings
 from ccatp.config.models import Config
 from ccatp.studies.campaign import CampaignError, Cell, CellResult, Job, JobOutcome
@@ -284,3 +285,45 @@ def test_a_damage_that_needs_a_survey_is_impossible_without_one(tmp_path: Path) 
     cfg = load_recordings_config(None, {"run.data": str(tmp_path)})
     factors = {"damage": "two beacons exchange names", "estimator": "fixed-lag"}
     assert run_damage(Job("damage", factors, 0, cfg)).values["outcome"] == "impossible"
+
+
+def test_a_later_start_without_readings_and_a_bag_without_topics_are_named(tmp_path: Path) -> None:
+    w = world(seconds=60.0)
+    early = [
+        line for line in csv_lines(w) if not line.startswith(("range", "bearing")) or float(line.split(",")[1]) < 20
+    ]
+    write_lines(tmp_path / "early.csv", early)
+    (tmp_path / "run.mcap").write_bytes(b"no bag")
+    (tmp_path / "torn.csv.gz").write_bytes(gzip.compress(b"time,anchor,range\n" * 99)[:40])
+    write_lines(tmp_path / "uwb.csv", ["time,anchor,range", "1,A,2"])
+    cfg = load_recordings_config(None, {"run.data": str(tmp_path)})
+    assert RECORDINGS.of_config is not None
+    notes = RECORDINGS.of_config(RECORDINGS, cfg).notes
+    assert [note.removeprefix(f"not used: {tmp_path}/").partition(":")[0] for note in notes] == [
+        "run.mcap", "torn.csv.gz", "uwb.csv",
+    ]  # fmt: skip
+    assert "name its topics in run.toml beside it" in notes[0]
+    assert "torn.csv.gz cannot be read" in notes[2]
+    found = run_recordings(Job("recordings", {"data": "early", "estimator": "ekf-slam"}, 5, cfg))
+    assert found.values["gave_up"] is True
+    assert found.values["why"] == "early: none of its readings can be used"
+    whole = combine_recordings({}, [JobOutcome({"path_m": 1.0}), found])
+    assert whole.values["gave_up"] == 1
+    assert whole.values["why"] == [found.values["why"]]
+
+
+def test_a_damage_of_a_recording_with_two_tags_keeps_their_places(tmp_path: Path) -> None:
+    lines = [
+        f"{line},{'ab'[k // 2 % 2]}" if line.startswith(("range", "bearing")) else line
+        for k, line in enumerate(csv_lines(world(seconds=60.0)))
+    ]
+    write_lines(tmp_path / "two.csv", [*lines, "tag,a,0.2,0.1,0.3", "tag,b,-0.2,-0.1"])
+    cfg = load_recordings_config(None, {"run.data": str(tmp_path)})
+    run = recorded_run(str(tmp_path), "two", None)
+    tables, truth = events_of(run, 0.0, 60.0)
+    again = read_again(run, tables, truth)
+    assert again.tags == run.tags
+    for one, two in zip(again.readings[5:], run.readings[5:], strict=True):
+        assert np.array_equal(np.asarray(one), np.asarray(two))
+    factors = {"damage": "two clock epochs", "estimator": "ekf-slam"}
+    assert run_damage(Job("damage", factors, 0, cfg)).values["outcome"] != "impossible"
