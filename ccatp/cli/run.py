@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from ccatp.cli import common
+from ccatp.errors import ConfigError
 
 PLOTJUGGLER_PORT = 9872
 FOXGLOVE_PORT = 8765
@@ -68,6 +69,8 @@ def run(
         run_dir = find_unfinished()
     if resume and config_file is None and run_dir is not None:
         config_file = run_dir / "config.toml"
+        if not config_file.is_file():
+            raise ConfigError(f"--resume: {run_dir}: no config.toml there; name the directory of a run with --run-dir")
     from ccatp.daemon.supervision.supervisor import run as run_to_the_end
 
     options = RunOptions(

@@ -124,11 +124,17 @@ def test_run_hands_over_what_was_asked_for_and_nothing_else(stub: Stub, tmp_path
     assert all(server.start("time", []) is None for _, server in calls)  # each has ended with its command
 
 
-def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> None:
+def test_a_resumed_run_takes_the_configuration_of_its_directory(
+    stub: Stub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     calls = stub("ccatp.daemon.supervision.supervisor", "run", 0)
-    assert main(["run", "--sim", "--resume", "--run-dir", "runs/a"]) == 0
+    config = tmp_path / "config.toml"
+    assert main(["run", "--sim", "--resume", "--run-dir", str(tmp_path)]) == 2
+    assert f"--resume: {tmp_path}: no config.toml there; name the directory of a run" in capsys.readouterr().err
+    config.touch()
+    assert main(["run", "--sim", "--resume", "--run-dir", str(tmp_path)]) == 0
     options, _ = calls[0]
-    assert (options.config_file, options.run_dir, options.resume) == (Path("runs/a/config.toml"), Path("runs/a"), True)
+    assert (options.config_file, options.run_dir, options.resume) == (config, tmp_path, True)
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_the_line(s: Engagement, verdict: Verdict | None, offers: tuple[str, ...
     assert line_of(s, verdict, offers, **told) == line
 
 
-def test_nobody_is_told_to_resume_a_mission_that_cannot_be_continued() -> None:
+def test_nobody_is_asked_to_resume_a_mission_that_cannot_be_continued() -> None:
     stopped = Engagement(Over(SurveyOutcome.STOPPED), cause=BLOCKED)
     for s, hands in ((stopped, "look for an obstacle at the wheel; "), (Engagement(Over(SurveyOutcome.STOPPED)), "")):
         turn = turn_of(s, None, (), resumes=False)

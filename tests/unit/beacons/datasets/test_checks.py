@@ -189,7 +189,7 @@ def test_a_radio_off_the_origin_is_no_other_clock(arm_m: tuple[float, float], wh
         assert sizes_m == pytest.approx(np.abs(arm_m), abs=0.05)  # sigma of a range
 
 
-def test_beacons_above_the_radio_are_told_from_those_in_its_plane() -> None:
+def test_beacons_above_the_radio_are_distinguished_from_those_in_its_plane() -> None:
     nothing = np.full(READ.range_m.size, np.nan)
     run = with_readings(range_m=np.hypot(READ.range_m, 2.5), bearing_rad=nothing)
     (line,) = [line for line in suspicions(run) if "above or below" in line]

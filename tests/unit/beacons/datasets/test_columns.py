@@ -331,7 +331,7 @@ def test_a_tag_that_no_column_names_is_refused(name: str, lines: list[str], what
         ("time,A1,A2,A3", "has no column with the name of a beacon or a range, bearing or rssi"),
     ],
 )
-def test_a_header_that_is_not_understood_is_told(header: str, what: str, tmp_path: Path) -> None:
+def test_a_header_that_is_not_understood_is_reported(header: str, what: str, tmp_path: Path) -> None:
     long_form(tmp_path)
     rewritten(tmp_path, header, *(["1,2,3,4"[: len(header.split(",")) * 2 - 1]] * 5))
     with pytest.raises(RadioDataError, match=what):
