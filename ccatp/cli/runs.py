@@ -20,7 +20,7 @@ FILES = {
     "mission.sqlite": "points and fixes",
     "telemetry.mcap": "recording, for ccatp replay, Foxglove and PlotJuggler",
     "log.jsonl": "log of all processes",
-    "alarms.jsonl": "events of the alarms",
+    "alarms.jsonl": "what happened to the alarms",
     "config.toml": "the exact configuration",
     "checkpoint": "state of a mission that can be resumed",
     "faults.toml": "faults that were injected",

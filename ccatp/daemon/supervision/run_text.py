@@ -14,8 +14,9 @@ from ccatp.missions import kind_of
 
 
 def arrival(status: MissionStatus) -> tuple[str, str]:
-    """Name and value of the error at the last point; it is exactly zero before the first arrival."""
-    shown = f"{status.error_mm:.2f} mm from the last point, as estimated" if status.error_mm else "none yet"
+    """Name and value of the error at the last point; it is exactly zero before the first arrival of a main loop."""
+    none = "none since the main loop began" if status.done else "none yet"
+    shown = f"{status.error_mm:.2f} mm from the last point, as estimated" if status.error_mm else none
     return "arrival", shown
 
 

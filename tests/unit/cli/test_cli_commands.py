@@ -167,7 +167,9 @@ def test_the_table() -> None:
         ("arrival", "0.05 mm from the last point, as estimated"),
         ("event code", "0 normal"),
     ]
-    assert dict(status_rows({**STATUS, "error_mm": 0.0}))["arrival"] == "none yet"
+    assert dict(status_rows({**STATUS, "error_mm": 0.0, "done": 0}))["arrival"] == "none yet"
+    resumed = dict(status_rows({**STATUS, "error_mm": 0.0, "done": 3}))
+    assert resumed["arrival"] == "none since the main loop began"  # points were measured by one before it
     held = {
         **STATUS, "state": "held", "point": "", "cause": "operator", "code": 2, "missed_deadlines": 4,
         "worst_lateness_ms": 31.0, "exit_status": 4, "outcome": "stopped",
