@@ -67,9 +67,12 @@ class AlignedPoints(NamedTuple):
         lines = [f"{len(self.assigned.measured)} targets on {len(self.result.panels)} panels that could be fitted"]
         if self.fitted is not None:
             residual_um = 1e6 * float(np.sqrt(np.mean(self.fitted.residuals_m**2)))
+            lengths_um = 1e6 * np.linalg.norm(self.fitted.residuals_m, axis=1)
+            worst = int(np.argmax(lengths_um))
             lines.append(
                 f"frame of the instrument: fitted to {len(self.fitted.residuals_m)} reference points, residuals "
-                f"{residual_um:.1f} um rms in a coordinate; panels share its uncertainty"
+                f"{residual_um:.1f} um rms in a coordinate, the largest {lengths_um[worst]:.1f} um at "
+                f"{self.fitted.labels[worst]}; panels share its uncertainty"
             )
         if (figure := self.figure) is not None:
             lines.append(
@@ -178,7 +181,7 @@ def _in_world(
     labels = [readings[at].label for at in known]
     if len(set(labels)) < len(labels):
         raise PointsError(f"{options.points}: a reference label stands on two lines; give each reference once")
-    fitted = fit_frame(own[known], np.array([named[label] for label in labels]).reshape(-1, 3))
+    fitted = fit_frame(own[known], np.array([named[label] for label in labels]).reshape(-1, 3), labels)
     rest = [at for at in range(len(readings)) if at not in set(known)]
     return fitted, tuple(readings[at] for at in rest), own[rest]
 

@@ -22,6 +22,7 @@ _REPEATS = 3  # least number of repeated readings that show a scatter
 _LEAST_MODE = 1e-3  # part of the largest mode from which a common one is told from the others
 _AXIS_SHIFT_M = 0.12  # between the optical frame and that of the azimuth axis, along the elevation axis
 _FRAME_RATIO = 10.0  # of residuals of the references without and with a mirrored axis, from which the frame is mirrored
+_MOST_RESIDUAL_M = 1e-3  # rms in a coordinate of references that an instrument measures to hundredths of a millimetre
 _TWICE = (1.8, 2.2)  # deviations over the target's offset if its sign is wrong
 # The middle of all points is never further from the surface: panels differ from it by tenths of a millimetre.
 _ON_SURFACE_M = 0.003
@@ -41,11 +42,15 @@ class ForeignPoint(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """World from the instrument's frame: rotation, shift, residuals of the references, m, sigma of one coordinate."""
+    """World from the instrument's frame: rotation, shift, m; residuals of the references, m, with their labels.
+
+    ``sigma_m``: of one coordinate, by the residuals.
+    """
 
     rotation: FloatArray
     shift_m: FloatArray
     residuals_m: FloatArray
+    labels: tuple[str, ...]
     sigma_m: float
     covariance: FloatArray  # (6, 6) of a small rotation about the references' centre, and of the shift
     centre_m: FloatArray
@@ -62,7 +67,7 @@ def world_from(frame: Frame, mirror: Mirror, places_m: FloatArray) -> FloatArray
     return places_m
 
 
-def fit_frame(own_m: FloatArray, world_m: FloatArray) -> Fitted:
+def fit_frame(own_m: FloatArray, world_m: FloatArray, labels: Sequence[str]) -> Fitted:
     """The rigid motion of reference points (k, 3) by least squares (Arun 1987); raises ``PointsError``."""
     if len(own_m) < 3:
         raise PointsError(f"{len(own_m)} reference points have the label of a point of the file; it takes three")
@@ -80,12 +85,18 @@ def fit_frame(own_m: FloatArray, world_m: FloatArray) -> Fitted:
         mirrored = b - a @ u @ vt
         if rms > _FRAME_RATIO * max(float(np.sqrt(np.mean(mirrored**2))), 1e-9):
             raise PointsError("the instrument's frame is left-handed: the references fit with one axis turned round")
+    if rms > _MOST_RESIDUAL_M:
+        worst = int(np.argmax(np.linalg.norm(left, axis=1)))
+        raise PointsError(
+            f"the references do not fit the points of the file: residuals of {1e3 * rms:.3g} mm rms in a coordinate, "
+            f"the largest at {labels[worst]}; check labels and units of both files"
+        )
     dof = 3 * len(own_m) - 6
     sigma = float(np.sqrt(np.sum(left**2) / dof)) if dof > 0 else 0.0
     turned = a @ rotation.T
     design = np.vstack([np.hstack([_cross(one), np.eye(3)]) for one in turned])
     covariance = sigma**2 * np.linalg.inv(design.T @ design)
-    return Fitted(rotation, target - rotation @ centre, left, sigma, covariance, target)
+    return Fitted(rotation, target - rotation @ centre, left, tuple(labels), sigma, covariance, target)
 
 
 def _cross(v: FloatArray) -> FloatArray:

@@ -101,6 +101,9 @@ def test_frames_are_right_handed_and_the_mirrors_lie_where_the_manufacturer_says
     assert found == pytest.approx(np.array([[0.0, 0.0, 3.6], [0.0, -4.8, 0.0]]), abs=1e-12)
 
 
+REFERENCES = [f"R{k}" for k in range(8)]
+
+
 def turned(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     a, b = 0.7, -0.4
     first = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
@@ -112,12 +115,12 @@ def turned(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def test_the_frame_of_an_instrument_is_fitted_with_its_covariance() -> None:
     world = np.random.default_rng(2).uniform(-3.0, 3.0, size=(8, 3))
     own, rotation, shift = turned(world)
-    exact = fit_frame(own, world)
+    exact = fit_frame(own, world, REFERENCES)
     assert exact.rotation == pytest.approx(rotation, abs=1e-12)
     assert exact.shift_m == pytest.approx(shift, abs=1e-12)
     rng, pulls = np.random.default_rng(3), []
     for _ in range(200):
-        fitted = fit_frame(own, world + 20e-6 * rng.normal(size=world.shape))
+        fitted = fit_frame(own, world + 20e-6 * rng.normal(size=world.shape), REFERENCES)
         error = fitted.rotation @ (rotation.T) - np.eye(3)
         vector = np.array([error[2, 1], error[0, 2], error[1, 0]])
         pulls.append(vector @ np.linalg.solve(fitted.covariance[:3, :3], vector))
@@ -130,6 +133,9 @@ def test_the_frame_of_an_instrument_is_fitted_with_its_covariance() -> None:
     [
         (lambda own: own * [1.0, -1.0, 1.0], "left-handed"),
         (lambda own: own[:2], "2 reference points"),
+        (lambda own: own[[0, 1, 3, 2, 4, 5, 6, 7]], "the largest at R[23]; check labels and units"),
+        (lambda own: own + 0.02 * (np.arange(8) == 5)[:, None], "the largest at R5"),
+        (lambda own: 1e3 * own, "do not fit the points of the file"),
         (lambda own: np.outer(np.arange(8.0), [1.0, 2.0, 3.0]), "lie on one line"),
     ],
 )
@@ -137,7 +143,7 @@ def test_references_that_give_no_frame_are_refused(change: Callable[[FloatArray]
     world = np.random.default_rng(2).uniform(-3.0, 3.0, size=(8, 3))
     own = change(turned(world)[0])
     with pytest.raises(PointsError, match=message):
-        fit_frame(own, world[: len(own)])
+        fit_frame(own, world[: len(own)], REFERENCES)
 
 
 # -- panels -----------------------------------------------------------------------------------------------------------
@@ -177,6 +183,7 @@ def test_the_own_frame_of_a_tracker_with_references(aligned: Callable[..., Any],
     # The frame adds to the standard deviation of the piston, 15 um / 3.
     assert all(panel["sigma"][0] > 6.0 for panel in found["panels"])
     assert len(found["instrument"]["reference_residuals_um"]) == 6
+    assert any("um rms in a coordinate, the largest" in line for line in found["warnings"])
 
 
 def test_repeated_readings_that_scatter_more_than_claimed_scale_the_sigmas(aligned: Callable[..., Any]) -> None:
