@@ -1,6 +1,7 @@
 """The laser network of a survey in words and as data: whether it is consistent, what changed, what is open."""
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from ccatp.mirror.network_model import Effect, EffectKind
 from ccatp.mirror.network_points import CalibratedSurveys
 
 MICRO = 1e6
+_MANY_CHANGES = 3  # of one channel, from which they are told together
 GAUGE = "a common motion of all collimators, which shows in no length"
 
 
@@ -31,7 +33,7 @@ def sentence(found: CalibratedSurveys | None) -> str:
             "each other, so nothing says which of them moved; survey all collimators again; until then each point is "
             f"uncertain by {_share_um(found):.0f} um ({noise})."
         )
-    changes = "; ".join(finding_text(found, one) for one in network.findings)
+    changes = "; ".join(_changes(found))
     return f"The laser network has changed: {changes} ({noise}); the panels are computed with it."
 
 
@@ -91,6 +93,24 @@ def network_lines(found: CalibratedSurveys | None) -> list[str]:
     """The network in the output of ``ccatp align``."""
     lines = "", sentence(found), air_text(found), undetermined_text(found)
     return [line for line in lines if line or found is not None]
+
+
+def _changes(found: CalibratedSurveys) -> Iterator[str]:
+    """Each finding; many changes of one channel together, which are the parts of one that is not in the model."""
+    findings = found.network.findings
+    channels = Counter(one.effect.of for one in findings if one.effect.is_of_channel)
+    told = set[int]()
+    for one in findings:
+        of = one.effect.of
+        if not one.effect.is_of_channel or channels[of] < _MANY_CHANGES:
+            yield finding_text(found, one)
+        elif of not in told:
+            told.add(of)
+            sizes = [abs(other.size) for other in findings if other.effect.is_of_channel and other.effect.of == of]
+            yield (
+                f"channel {found.channels[of]} changes {len(sizes)} times, by up to {MICRO * max(sizes):.1f} um: it "
+                "drifts or is noisy, or its collimator moves"
+            )
 
 
 def finding_text(found: CalibratedSurveys, finding: Finding) -> str:

@@ -408,6 +408,25 @@ def test_a_slip_in_the_second_of_two_surveys_is_said_to_be_there() -> None:
     assert " of survey 2 (" in text
 
 
+def drifting(number: int, some: dict[int, float]) -> dict[int, float]:
+    return some | {5: some[5] + 2e-5 * number}
+
+
+def test_a_channel_that_drifts_is_told_as_one_that_changes_often() -> None:
+    """A drift of one channel is not in the model: its parts are told together, and the panels are right."""
+    measured = survey(drifting, LIES)
+    result, network = align_survey(CFG, M1, measured, PANELS)
+    assert network is not None
+    assert {one.effect.of for one in network.network.findings} == {4}
+    text = sentence(network)
+    assert text.startswith("The laser network has changed: channel 5 changes ")
+    assert " times, by up to " in text
+    assert ": it drifts or is noisy, or its collimator moves (" in text
+    against = compare(result.panels, TRUTH)
+    assert against is not None
+    assert against.chi2 < against.high
+
+
 def slipped_all_along(_: int, some: dict[int, float]) -> dict[int, float]:
     return some | {3: some[3] + 3e-4}
 
