@@ -254,6 +254,8 @@ class SummaryBuilder:
         self._settle(is_over=True)
         cfg, is_sim = self._cfg, self._is_sim
         arrivals = np.array(list(self._arrivals.values()))
+        # Of measured points whose arrivals are all lost with the truth, nothing is known.
+        within = int(np.count_nonzero(arrivals <= WITHIN_M)) if len(arrivals) or not self._measured else None
         # Without a point that was measured the robot stood at its known start: no figure of its localization.
         distances = self._distances if self._measured else RunningStatistics(1)
         count = distances.count
@@ -267,7 +269,7 @@ class SummaryBuilder:
             "points": {
                 "total": self._points,
                 "measured": self._measured,
-                "first_arrival_within_10mm": int(np.count_nonzero(arrivals <= WITHIN_M)),
+                "first_arrival_within_10mm": within,
                 "skipped": self._skipped,
                 **({"unreliable": self._unreliable} if self._unreliable else {}),
                 **({"left_out": {why: list(names) for why, names in self._left_out.items()}} if self._left_out else {}),

@@ -193,7 +193,7 @@ def test_a_whole_summary_has_the_keys_of_the_contract_in_their_order(builder: Su
     assert list(built["points"]) == ["total", "measured", "first_arrival_within_10mm", "skipped"]
     assert list(built["arrival_error_mm"]) == ["mean", "p50", "p99", "max"]
     assert list(built["localization_error_mm"]) == ["mean", "p50", "p99", "max", "within_10mm_fraction"]
-    assert built["points"] == {"total": 693, "measured": 690, "first_arrival_within_10mm": 0, "skipped": 3}
+    assert built["points"] == {"total": 693, "measured": 690, "first_arrival_within_10mm": None, "skipped": 3}
     assert built["within_budget"] is True
     assert built["wall"] == {"time_s": 60.0, "realtime_factor": 60.0, "tick_us_p50": 110.0, "tick_us_p99": 119.8}
     json.dumps(built, allow_nan=False)
@@ -232,7 +232,7 @@ def test_a_real_robot_has_null_where_the_truth_is_needed() -> None:
     builder.set_panels({PanelId(1, 1): (0.0, 0.0, 0.0)}, None)
     built = builder.build()
     assert (built["world"], built["reference"]) == (None, "laser")
-    assert built["points"]["first_arrival_within_10mm"] == 0  # of none that was measured
+    assert built["points"]["first_arrival_within_10mm"] is None  # no fix of a measured point is known
     assert set(built["danger"].values()) == {None}
     assert {*built["arrival_error_mm"].values(), *built["localization_error_mm"].values()} == {None}
     assert built["heading_error_mrad"]["rms"] is None
