@@ -215,8 +215,9 @@ def draw_slam(
     }
     surveyed = np.array([run.beacon_truth_m[name] for name in beacons if name in run.beacon_truth_m]).reshape(-1, 2)
     path = judged.alignment.moved(track.poses[:, :2])
+    moved = {name: judged.alignment.moved(one.places_m) for name, one in track.tracks.items()}
     # What is shown: path and beacons, wherever dead reckoning went.
-    points = np.vstack([path, surveyed, *(place + outline for place, outline in beacons.values())])
+    points = np.vstack([path, surveyed, *moved.values(), *(place + outline for place, outline in beacons.values())])
     low, high = points.min(axis=0), points.max(axis=0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low) + 0.06 * float((high - low).max()) + 1e-3
     half[0] = max(half[0], half[1] / 1.1)  # limits the aspect ratio of the picture
@@ -244,6 +245,9 @@ def draw_slam(
         axes.plot(*place, "o", color=_MAP, markersize=4.5, zorder=7, label=label)
         axes.plot(*(place + outline).T, color=_MAP, linewidth=1.0, zorder=5)
         axes.annotate(name, place, xytext=(6, 5), textcoords="offset points", fontsize=8, color=INK, zorder=8)
+    for name, places in moved.items():  # of a beacon that moves, or its earlier places
+        axes.plot(*places.T, ".:", color=_MAP, markersize=3.0, linewidth=0.8, zorder=5)
+        axes.annotate(name, places[0], xytext=(6, -11), textcoords="offset points", fontsize=8, color=QUIET, zorder=8)
     axes.set(xlim=(centre[0] - half[0], centre[0] + half[0]), ylim=(centre[1] - half[1], centre[1] + half[1]))
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     dress(*panels)
