@@ -91,6 +91,8 @@ class AlignedPoints(NamedTuple):
                     f"the readings of a panel are shifted together by {1e6 * repeats.shift_m:.1f} um from one to the "
                     "next: two nights, or two frames; align each on its own. All panels share the uncertainty"
                 )
+        if self.assigned.copies:
+            lines.append(f"{self.assigned.copies} readings are copies of others to the last digit, and count once")
         if self.assigned.by_position:
             lines.append(
                 f"{self.assigned.by_position} readings are assigned to panels by position, as their labels name none: "

@@ -160,13 +160,15 @@ class Repeats(NamedTuple):
 class Assigned(NamedTuple):
     """Measured points by panel, the label of each, and repeated readings; their mean is the point.
 
-    ``by_position``: readings whose label names no panel. ``row_first``: names of the observatory have the row first.
+    ``by_position``: readings whose label names no panel. ``copies``: copies of others to the last digit,
+    which count once. ``row_first``: names of the observatory have the row first.
     ``shifts`` (3, 1) of each point: the error of the mean that all points share by shifts between readings.
     """
 
     measured: tuple[Measured, ...]
     labels: Mapping[PointId, str]
     by_position: int
+    copies: int
     row_first: bool
     repeats: Repeats | None
     shifts: Mapping[PointId, FloatArray]
@@ -240,8 +242,11 @@ def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float, fals
     measured, labels, normals = list[Measured](), dict[PointId, str](), dict[PointId, tuple[FloatArray, int]]()
     readings = list[list[FloatArray]]()
     claimed = list[float]()
+    copies = 0
     for panel, rows in sorted(by_panel.items()):
-        targets = _targets(points, rows)
+        own = {points[at].place_m: at for at in reversed(rows)}
+        copies += len(rows) - len(own)
+        targets = _targets(points, sorted(own.values()))
         readings.append([])
         normal = np.array(mirror.rotate_world_from_deck(mirror.panel(panel).axes[2]))
         for number, same in zip(_numbers(points, targets), targets, strict=True):
@@ -263,6 +268,7 @@ def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float, fals
         tuple(measured),
         labels,
         by_position=sum(panel is None for panel in named),
+        copies=copies,
         row_first=row_first,
         repeats=repeats,
         shifts={

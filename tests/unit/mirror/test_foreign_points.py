@@ -197,6 +197,12 @@ def test_repeated_readings_that_scatter_more_than_claimed_scale_the_sigmas(align
     assert any("standard deviations are multiplied by" in line for line in found["warnings"])
 
 
+def test_copies_of_readings_count_once(aligned: Callable[..., Any]) -> None:
+    once, thrice = (aligned(rows(places(), labels()) * times) for times in (1, 3))
+    assert thrice["panels"] == once["panels"]
+    assert any("54 readings are copies of others" in line for line in thrice["warnings"])
+
+
 def test_readings_of_two_nights_that_differ_are_no_better_by_their_number(aligned: Callable[..., Any]) -> None:
     second = places(seed=2) + np.array([0.0, 0.0, 0.1])
     found = aligned([line for one in (places(seed=1), second) for line in rows(one, labels())])
