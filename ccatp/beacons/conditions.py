@@ -63,4 +63,9 @@ MAP_STALLED = fault("map_stalled", Owner.MISSION, ALONE, GROUP,
     "No range arrives that the map of the motes could use. The robot stands until there is a map. The limit is "
     "`danger.hold_limit_s`.", "Check the named motes: their supply, their names, and what is between them.",
     then="check the named motes")
+READINGS_REFUSED = fault("readings_refused", Owner.MISSION, ALONE, GROUP,
+    "{refused:g} of the last {count:g} readings contradict the estimated place: it is wrong, or the map",
+    "The robot was moved, its wheels slipped, samples came late, or beacons stand elsewhere.",
+    "`ccatp stop`, put it at its start, start again; if it repeats, check wheels, beacons and computer.",
+    then="put the robot at its start, and start a new mission")
 # fmt: on

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from ccatp.beacons.conditions import MAP_STALLED, MISSION_TOO_LONG, TARGET_LOST
+from ccatp.beacons.conditions import MAP_STALLED, MISSION_TOO_LONG, READINGS_REFUSED, TARGET_LOST
 from ccatp.beacons.config.models import RadioConfig
 from ccatp.beacons.modes import FOLLOWING, MAPPING, VISITING, BeaconMode, Deciding, Returning, Working
-from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
+from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator, Score
 from ccatp.beacons.pilot import BeaconPilot, FollowState
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.conditions import Action
@@ -74,6 +74,9 @@ def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -
     return drive
 
 
+_DOUBTED = 40  # readings, of which at most half may be refused
+
+
 class WaypointArrival(NamedTuple):
     """A reached waypoint."""
 
@@ -98,6 +101,7 @@ class BeaconMission(EngagedMission[Engagement]):
         self.arrivals: list[WaypointArrival] = []
         self._begun_s: float | None = None
         self._followed_s = self._lost_s = 0.0  # the second: since the followed radio was lost, or the mission began
+        self._scored = Score(0.0, 0, 0, 0)  # up to the first of the readings that are judged together
         self._map_readings, self._stalled_s = 0, 0.0  # of the self-mapping, and the time since the last useful one
         self._is_following = cfg.follow.is_active
 
@@ -136,12 +140,27 @@ class BeaconMission(EngagedMission[Engagement]):
         self.react(measurements, verdict)
         if verdict is None or not any(self.state.permits(verdict)):
             return HALT
+        if self._is_refused():
+            return HALT
         limit_s = self._cfg.mission.time_limit_s
         if t_s - self._begun_s > limit_s and self.state.mode is not IDLE and not self.state.abort_cause:
             self._state = RULES.meet(self.state, MISSION_TOO_LONG.cause(limit_s=limit_s))
             return HALT
         drive = self._wanted(measurements, interval_s)
         return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)
+
+    def _is_refused(self) -> bool:
+        """Judge readings together: an estimate that most of them contradict is wrong, however sure it is."""
+        score, before = self.navigator.score, self._scored
+        refused, used = score.refused - before.refused, score.used - before.used
+        if refused + used < _DOUBTED:
+            return False
+        self._scored = score
+        if 2 * refused <= _DOUBTED:
+            return False
+        cause = READINGS_REFUSED.cause(refused=refused, count=refused + used)
+        self._state = RULES.meet(self.state, cause)
+        return True
 
     def _wanted(self, measurements: BeaconMeasurements, interval_s: float) -> SteeringCommand:
         if self.navigator.is_mapping:

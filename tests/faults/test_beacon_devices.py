@@ -98,8 +98,14 @@ def cut_anywhere() -> Callable[[bytes], bytes]:
     return each(5, cut)
 
 
-def flipped(data: bytes) -> bytes:
-    return data[:-1] + bytes([data[-1] ^ 1])
+def stall_flipped(data: bytes) -> bytes:
+    """A standard packet in which a bit says that the left wheel is stalled."""
+    return data[:15] + bytes([data[15] ^ 1]) + data[16:] if len(data) > 20 else data
+
+
+def level_changed(data: bytes) -> bytes:
+    """A frame whose last byte of data, of a strength -99 dBm, was changed."""
+    return data[:-2] + b"\x63" + data[-1:]
 
 
 def base(**values: object) -> Change:
@@ -177,7 +183,7 @@ CONTINUES: dict[str, Change] = {
     "B13": lambda d: setattr(d.rig, "_sonars_m", lambda: [5.0] * 16),
     "B14": wrap,
     "B15": lambda d: setattr(d.rig.base, "corrupt", cut_anywhere()),
-    "B16": lambda d: setattr(d.rig.base, "corrupt", each(5, flipped)),
+    "B16": lambda d: setattr(d.rig.base, "corrupt", each(5, stall_flipped)),
     "B17": lambda d: setattr(d.rig.base, "corrupt", each(4, lambda _: b"")),
 }
 
@@ -339,7 +345,7 @@ def strangers(driving: Driving) -> None:
 
 IN_SCANS: dict[str, Change] = {
     "B31": lambda d: setattr(d.rig.radio, "corrupt", cut_anywhere()),
-    "B32": lambda d: setattr(d.rig.radio, "corrupt", each(5, flipped)),
+    "B32": lambda d: setattr(d.rig.radio, "corrupt", each(5, level_changed)),
     "B33": strangers,
     "B34": lambda d: setattr(
         d.rig.radio, "corrupt", each(3, lambda data: data + b"\x7e\x00\x07\x8b\x01\x7d\x84\x00\x00\x01\x71")

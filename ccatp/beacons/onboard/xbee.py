@@ -2,7 +2,7 @@
 
 ``DB`` of the module is the strength of the last hop of the last packet, whoever sent it. So a radio is asked for its
 name; after its answer the module is asked for ``DB``. The strength counts only if the answer fits sender and request,
-no other packet came in between, and no module relays the packets of this radio.
+no other packet and no damaged bytes came in between, and no module relays the packets of this radio.
 """
 
 from collections import Counter
@@ -50,6 +50,7 @@ class _Request(NamedTuple):
     tries_left: int
     frame_id: int
     until_s: float
+    damaged: int  # received bytes and sums so far
     has_answered: bool  # the radio; then the module is asked
 
 
@@ -62,7 +63,8 @@ class Coordinator(BeaconDevice):
         twins: names that several radios have; none of them is measured.
         resets: of the module.
         counts: requests without a strength: ``lost`` (no answer), ``failed`` (not transmitted, or refused), ``mixed``
-            (another packet came in between), ``none`` (the module has no strength that can be).
+            (another packet came in between, or damaged bytes, which may have been one), ``none`` (the module has no
+            strength that can be).
         reader: of the received bytes.
     """
 
@@ -221,7 +223,9 @@ class Coordinator(BeaconDevice):
                 self.radios[node.name] = node.address
                 (self.relayed.add if node.is_relayed else self.relayed.discard)(node.name)
         elif answer.command == b"DB" and request is not None and request.has_answered:
-            if answer.frame_id == request.frame_id:
+            if answer.frame_id == request.frame_id and request.damaged != self._damaged:
+                self._try_again(request, "mixed")
+            elif answer.frame_id == request.frame_id:
                 level = answer.data[-1] if answer.status == OK and answer.data else 0
                 name = request.name
                 is_own = 0 < level <= WEAKEST_DBM and name not in self.relayed  # 0: it has received nothing yet
@@ -236,6 +240,10 @@ class Coordinator(BeaconDevice):
                 name = self._answers[b"NI"].decode("ascii", "replace").strip()
                 self._identity = f"XBee {high}{low} {name}, firmware {version}"
 
+    @property
+    def _damaged(self) -> int:
+        return self.reader.counts["noise"] + self.reader.counts["bad_sums"]
+
     # -- requests -----------------------------------------------------------------------------------------------------
 
     def _try_again(self, request: _Request, why: str) -> None:
@@ -248,7 +256,7 @@ class Coordinator(BeaconDevice):
     def _send_request(self, name: str, address: int, tries_left: int, now_s: float) -> None:
         frame_id = self._next_id()
         until_s = now_s + self._config.answer_timeout_s
-        self._request = _Request(name, address, tries_left, frame_id, until_s, has_answered=False)
+        self._request = _Request(name, address, tries_left, frame_id, until_s, self._damaged, has_answered=False)
         self._send(format_remote_at(frame_id, address, b"NI"))
 
     def _next_id(self) -> int:

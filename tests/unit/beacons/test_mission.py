@@ -429,6 +429,25 @@ def test_a_map_that_gets_no_further_readings_is_a_fault_that_names_a_pair() -> N
     assert "phase 2 expects an error of 0.1" in found.cause
 
 
+@pytest.mark.parametrize(("wrong_in", "is_faulted"), [(1, True), (3, False)])
+def test_an_estimate_that_most_readings_contradict_is_a_fault(wrong_in: int, is_faulted: bool) -> None:
+    stage = BeaconSilWorld(radio_config_of("cricket"))
+    mission, navigator = stage.mission, stage.mission.navigator
+    while navigator.is_mapping:
+        stage.frame()
+    t_s, used = stage.robot.t_s, navigator.score.used
+    x_m, y_m, _ = navigator.belief.pose
+    name, (mote_x_m, mote_y_m, *_) = min(navigator.beacons.items())
+    delay_s = hypot(x_m - mote_x_m, y_m - mote_y_m) / 344.0
+    for k in range(60):
+        burst = MoteBurst(t_s, name, "robot", 20.0, [delay_s + (0.003 if k % wrong_in == 0 else 0.0)])  # 1 m
+        mission.step(BeaconMeasurements(t_s, (), BeaconFrame(motes=[burst])), 0.1, FREE)
+    assert mission.state.is_faulted is is_faulted
+    assert navigator.score.used > used or wrong_in == 1
+    if is_faulted:
+        assert "of the last 40 readings contradict the estimated place" in text_of(mission.state.cause)
+
+
 @pytest.mark.parametrize("system", ["cricket", "zigbee"])
 def test_samples_of_wheels_and_motes_count_at_their_own_times(system: str) -> None:
     """The wheels are sampled 0.07 s before the frame, a mote 0.03 s before it; the robot drives at 0.3 m/s."""

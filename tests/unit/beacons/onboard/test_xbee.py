@@ -83,6 +83,23 @@ def test_a_packet_in_between_is_no_measurement(kind: int) -> None:
     assert rig.ask("beacon1", packet_of_another(rig, kind)) == -40.0  # the second request is alone
 
 
+@pytest.mark.parametrize("api_mode", [1, 2])
+def test_damaged_bytes_in_between_may_have_been_a_packet(api_mode: int) -> None:
+    """At each place a byte of the other packet is changed, or lost: its strength is never taken for the radio's."""
+    rig = Rig(api_mode=api_mode).open()
+    damages = [
+        lambda data, k=k, byte=byte: data[:k] + byte + data[k + 1 :] for k in range(20) for byte in (b"", b"\x55")
+    ]
+    for damage in damages:
+
+        def corrupt(data: bytes, damage: Callable[[bytes], bytes] = damage) -> bytes:
+            return damage(data) if b"hello" in data else data
+
+        rig.device.corrupt = corrupt
+        assert rig.ask("beacon1", packet_of_another(rig)) in {-40.0, None}
+    assert rig.radio.counts["mixed"] > 20
+
+
 def test_an_answer_to_the_discovery_in_between_is_no_measurement() -> None:
     rig = Rig(tries=1).open()
     node = b"\x12\x34" + OTHER.to_bytes(8, "big") + b"x\x00\xff\xfe\x01\x00\xc1\x05\x10\x1e"
