@@ -225,15 +225,15 @@ def lose_steps(driving: Driving) -> None:
 
 ALL = "no level of beacon1, beacon2, beacon3, beacon4: "
 RADIO: dict[str, tuple[Attack, str]] = {
-    "garbage between frames": (also("radio", lambda: RNG.randbytes(30)), HANDLED),
+    "garbage between frames": (also("radio", lambda: RNG.randbytes(30)), "or damaged bytes, behind them"),
     "long lengths between frames": (also("radio", lambda: b"\x7e\x01\x00"), ALL + "60 requests without an answer"),
     "half frames": (corrupt("radio", lambda data: data[: len(data) // 2]), "garbage at 9600 baud"),
     "a wrong bit at every place": (corrupt("radio", every_place(flip, 5)), HANDLED),
     "a flood of packets of another radio": (
-        packet_of_another(b"\x90" + OTHER + b"\x12\x34\x01hi"), "answers with another packet behind them",
+        packet_of_another(b"\x90" + OTHER + b"\x12\x34\x01hi"), "answers with another packet",
     ),
     "a flood of transmit status": (packet_of_another(b"\x8b\x01\x7d\x84\x00\x00\x01"), HANDLED),
-    "each answer twice": (answers(0x97, lambda data: [data, data]), "answers with another packet behind them"),
+    "each answer twice": (answers(0x97, lambda data: [data, data]), "answers with another packet"),
     "answers of a wrong radio": (
         answers(0x97, lambda data: [data[:2] + OTHER + data[10:]]), ALL + "60 requests without an answer",
     ),

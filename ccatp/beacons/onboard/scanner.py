@@ -22,7 +22,7 @@ _SILENT_POSITIONS = 5  # without any level, which are reported before the end of
 _FAILURES = {
     "lost": "requests without an answer",
     "failed": "requests not delivered",
-    "mixed": "answers with another packet behind them",
+    "mixed": "answers with another packet, or damaged bytes, behind them",
     "none": "answers without a possible strength",
 }
 
