@@ -1,6 +1,6 @@
 """Whole simulated surveys with known errors of the laser network: is what ``ccatp align`` says of it true?
 
-``python -m tools.network_surveys [--surveys N] [--seed S] [--panels P]``. The robot drives each survey
+``python -m tools.network_surveys [--only N ...] [--seed S] [--panels P]``. The robot drives each survey
 (``ccatp.simulate``); mirrors, worlds and kinds of error take turns. In every survey each effect has an error as its
 prior says. All but the surveys without a change have a larger one besides, by a fault plan from the first length or
 from a point in the survey on. Prints a table in Markdown.
@@ -274,14 +274,14 @@ def totals(outcomes: Sequence[Outcome]) -> list[str]:
 def main() -> None:
     """Run the campaign, and print its result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--surveys", type=int, default=2 * len(KINDS))
+    parser.add_argument("--only", type=int, nargs="+", default=range(2 * len(KINDS)), help="numbers of surveys")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--panels", type=int, default=0)
     args = parser.parse_args()
     outcomes = list[Outcome]()
-    for number in range(args.surveys):
+    for number in args.only:
         outcomes.append(judge(survey(draw(number, args.seed), args.panels)))
-        print(rows(outcomes[-1:])[-1], flush=True)
+        print("\n".join(rows(outcomes[-1:])[0 if len(outcomes) == 1 else -1 :]), flush=True)
     print("\n".join(["", *totals(outcomes)]))
 
 
