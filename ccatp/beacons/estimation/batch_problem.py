@@ -8,7 +8,7 @@ import numpy as np
 
 from ccatp.beacons.config.models import OdometryNoiseConfig, PriorsConfig, RecordingConfig
 from ccatp.beacons.estimation.measurement_models import bearing_row, level_row, range_row, range_variance
-from ccatp.beacons.estimation.motion import POSE, step_variances, turned_way
+from ccatp.beacons.estimation.motion import POSE, resting, step_variances, turned_way
 from ccatp.beacons.estimation.recording import BeaconId, BoolArray, Readings, RecordedRun, Steps, running_total
 from ccatp.core import FloatArray, IntArray
 from ccatp.filters.metrics import wrapped
@@ -45,7 +45,7 @@ class Reckoning:
         self._starts = np.searchsorted(fine_s, times_s)[:-1]
         self._lengths = np.diff(np.append(self._starts, fine_s.size - 1))
         lasts_s = np.diff(steps.times_s)
-        rests = (np.abs(steps.distance_m) < rest[0] * lasts_s) & (np.abs(steps.turn_rad) < rest[1] * lasts_s)
+        rests = resting(steps.times_s, steps.distance_m, steps.turn_rad, rest)
         within = rests & (steps.times_s[:-1] >= times_s[0]) & (steps.times_s[:-1] < times_s[-1])
         self.at_rest = float(lasts_s[within].sum()), float(steps.turn_rad[within].sum())
 

@@ -12,13 +12,30 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError
 
-from ccatp.beacons.config.models import FixedLagConfig, RadioNoiseConfig, RecordingConfig, SlamFilterConfig
-from ccatp.beacons.estimation.batch_problem import BEACON, RSSI_REFERENCE, SHARED, BatchProblem, BatchState, PlacePrior
+from ccatp.beacons.config.models import (
+    FixedLagConfig,
+    OdometryNoiseConfig,
+    RadioNoiseConfig,
+    RecordingConfig,
+    SlamFilterConfig,
+)
+from ccatp.beacons.estimation.batch_problem import (
+    BEACON,
+    RSSI_REFERENCE,
+    SHARED,
+    BatchProblem,
+    BatchState,
+    BeaconNoise,
+    PlacePrior,
+)
 from ccatp.beacons.estimation.causal import Followed, beyond_priors, follow
 from ccatp.beacons.estimation.evaluation import aligned_beacons
 from ccatp.beacons.estimation.landmark_init import LEAST
 from ccatp.beacons.estimation.least_squares import WELL_CONVERGED, Factored, descend, t_weights
+from ccatp.beacons.estimation.odometry_noise import OdometryNoise, odometry_noise
+from ccatp.beacons.estimation.range_noise import range_noise
 from ccatp.beacons.estimation.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun, Steps
+from ccatp.beacons.estimation.window import spread_by_priors
 from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.beacons.rigid_motion import best_motion
 from ccatp.core import FloatArray
@@ -27,8 +44,9 @@ SPACING_S = 0.5  # longest interval between poses without readings
 FAR_OFF = 4.0  # median of the squared normalised residuals above which it is used as softness of the first iterations
 ROUGH_ITERATIONS, ROUGHLY = 6, 1e-3
 ITERATIONS = 40
-WIDENINGS = 8
+ESTIMATES = 8  # of the noise
 WIDER = 1.05  # the noise is increased if the residuals exceed it by this factor
+CLOSE = 0.1  # relative change of the variances of ranges and odometry at which they have converged
 NOISY = 4.0  # largest increase of the noise without a warning
 LITTLE = 0.1  # a reading with a smaller weight counts as refused
 
@@ -129,41 +147,29 @@ def smooth(
     pose is the only part of the ground truth that is used. ``found``: a causal estimate of the run, if there is one.
     Raises LinAlgError: the normal equations of the result are not positive definite.
     """
-    begin_s, first_radio = clock_s(), settings.radio
+    begin_s = clock_s()
     steps_s = run.steps.times_s  # poses are at all readings, and every SPACING_S at a step of the odometry
     _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
     readings = run.readings.with_distances(settings.radio.camera_field_rad)
     times_s = np.union1d(readings.times_s, steps_s[first])
     found = found or follow(run, settings, how, lambda: 0.0, SPACING_S)
-    settings = settings.model_copy(update={"priors": found.priors})
-    start, rest = _started(run, settings, found, times_s), (how.rest_speed_m_s, how.rest_turn_rad_s)
+    start, rest = _started(run, found.settings, found, times_s), (how.rest_speed_m_s, how.rest_turn_rad_s)
     removed = {str(name) for name, _ in found.slam.moved}
     places = None
     if run.known_map is not None:
         places = PlacePrior.of_run(run, [name for name in run.beacon_ids if name not in removed])
 
-    def problem_of(settings: RecordingConfig) -> BatchProblem:
+    def problem_of(settings: RecordingConfig, noise: BeaconNoise) -> BatchProblem:
         return BatchProblem(
-            run.steps, readings, times_s, run.first_pose, settings, start.used, rest, noise=found.noise, places=places
+            run.steps, readings, times_s, run.first_pose, settings, start.used, rest, noise=noise, places=places
         )  # fmt: skip
 
-    problem = problem_of(settings)
+    fit = _fitted(problem_of, start.state, found, settings.odometry)
+    problem, state = fit.problem, fit.state
     counted = problem.sizes > 0
-    off = problem.residuals(start.state).chi2[counted] / problem.sizes[counted]
-    state, softness = start.state, float(np.median(off)) if counted.any() else 0.0
-    if softness > FAR_OFF:
-        state, _ = descend(problem, state, ROUGH_ITERATIONS, softness, enough=ROUGHLY)
-    state, converged = descend(problem, state, ITERATIONS, enough=WELL_CONVERGED)
-    for _ in range(WIDENINGS):
-        radio = _widened(problem, state)
-        if radio == problem.radio:
-            break
-        settings = settings.model_copy(update={"radio": radio})
-        problem = problem_of(settings)
-        state, converged = descend(problem, state, ITERATIONS)
     took_s = clock_s() - begin_s
     weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)
-    factored = Factored(problem.normal_equations(state, weights * problem.power))
+    factored = spread_by_priors(fit.factored, problem, settings.priors)
     size = problem.free.size
     covariance = np.zeros((size, size))
     covariance[np.ix_(problem.free, problem.free)] = factored.shared_covariance()
@@ -176,16 +182,64 @@ def smooth(
         of_map += range(place.start, place.stop)
     calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)))
     priors = {name: getattr(problem.priors, name) for name in SHARED}
-    warnings = [*_warnings(run, start, converged), *beyond_priors(calibration, priors, run.kind)]
-    for what, name in (("range", "range_sigma_m"), ("bearing", "bearing_sigma_rad"), ("rssi", "rssi_sigma_db")):
-        if (ratio := getattr(problem.radio, name) / getattr(first_radio, name)) > NOISY:
-            much = f"{ratio:.1f} times as noisy as assumed"
-            warnings.append(f"{what} readings are {much}: beacons exchanged or moved on the way?")
+    warnings = [*_warnings(run, start, fit.converged), *beyond_priors(calibration, priors, run.kind)]
+    warnings += _noise_warnings(problem.radio, settings.radio, fit.noise.variance)
     return EstimatedPath(
         times_s, state.poses, factored.pose_covariances(), beacons, calibration, updates=updates,
         refused=int((weights[counted] < LITTLE).sum()), update_s=np.array([took_s / max(updates, 1)]),
         warnings=tuple(warnings), map_covariance=covariance[np.ix_(of_map, of_map)],
     )  # fmt: skip
+
+
+class _Fit(NamedTuple):
+    """The least squares, with the noise that was estimated."""
+
+    problem: BatchProblem
+    state: BatchState
+    factored: Factored
+    converged: bool
+    noise: BeaconNoise
+
+
+def _fitted(
+    problem_of: Callable[[RecordingConfig, BeaconNoise], BatchProblem], state: BatchState, found: Followed,
+    configured: OdometryNoiseConfig,
+) -> _Fit:  # fmt: skip
+    """Solve with the noise that is known, estimate the noise from the residuals, and solve again until it is stable."""
+    settings, noise, odometry = found.settings, found.noise, found.odometry
+    problem = problem_of(settings, noise)
+    counted = problem.sizes > 0
+    off = problem.residuals(state).chi2[counted] / problem.sizes[counted]
+    if counted.any() and (softness := float(np.median(off))) > FAR_OFF:
+        state, _ = descend(problem, state, ROUGH_ITERATIONS, softness, enough=ROUGHLY)
+    state, converged = descend(problem, state, ITERATIONS, enough=WELL_CONVERGED)
+    for _ in range(ESTIMATES):
+        factored, before = _factored(problem, state), (noise.variance, noise.repeats, np.array(odometry))
+        if settings.radio.correlation_s == 0.0:  # otherwise readings that share their error are counted as configured
+            noise = range_noise(problem, state, noise)
+        odometry = odometry_noise(problem, state, factored, configured, odometry, OdometryNoise())
+        radio, after = _widened(problem, state), (noise.variance, noise.repeats, np.array(odometry))
+        is_close = all(np.allclose(a, b, rtol=CLOSE, atol=0.0) for a, b in zip(before, after, strict=True))
+        if is_close and radio == problem.radio:
+            break
+        settings = settings.model_copy(update={"radio": radio, "odometry": odometry.of(configured)})
+        problem = problem_of(settings, noise)
+        state, converged = descend(problem, state, ITERATIONS)
+    return _Fit(problem, state, _factored(problem, state), converged, noise)
+
+
+def _noise_warnings(radio: RadioNoiseConfig, configured: RadioNoiseConfig, variances: FloatArray) -> Iterator[str]:
+    of_ranges = float(np.sqrt(variances.mean())) if variances.size else 1.0
+    for what, name in (("range", "range_sigma_m"), ("bearing", "bearing_sigma_rad"), ("rssi", "rssi_sigma_db")):
+        ratio = getattr(radio, name) / getattr(configured, name) * (of_ranges if what == "range" else 1.0)
+        if ratio > NOISY:
+            much = f"{ratio:.1f} times as noisy as assumed"
+            yield f"{what} readings are {much}: beacons exchanged or moved on the way?"
+
+
+def _factored(problem: BatchProblem, state: BatchState) -> Factored:
+    weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)
+    return Factored(problem.normal_equations(state, weights * problem.power))
 
 
 def _widened(problem: BatchProblem, state: BatchState) -> RadioNoiseConfig:

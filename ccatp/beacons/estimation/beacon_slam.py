@@ -8,7 +8,7 @@ from math import inf, log, sqrt
 import msgspec
 import numpy as np
 
-from ccatp.beacons.config.models import RecordingConfig, SlamFilterConfig
+from ccatp.beacons.config.models import OdometryNoiseConfig, RecordingConfig, SlamFilterConfig
 from ccatp.beacons.estimation.beacon_map import (
     FURTHEST,
     HEADING,
@@ -150,6 +150,19 @@ class BeaconSlam:
         """Covariance of x_m, y_m, heading_rad, shape (3, 3)."""
         return self.engine.covariance[:POSE, :POSE].copy()
 
+    def error_covariance(self, columns: slice | Columns, excess: Mapping[str, tuple[float, float]]) -> FloatArray:
+        """Covariance of the errors of states, (k, k), if calibrations vary more than their priors assume.
+
+        ``excess``: assumed and actual prior variance of calibrations by name: see ``Factored.spread_by``.
+        """
+        P = self.engine.covariance[columns][:, columns].copy()
+        for i, name in enumerate(self._names):
+            assumed, actual = excess.get(name, (1.0, 0.0))
+            if actual > assumed:
+                by_mean = self.engine.covariance[columns, POSE + i] / assumed
+                P += (actual - assumed) * np.outer(by_mean, by_mean)
+        return P
+
     @property
     def beacons(self) -> dict[BeaconId, BeaconEstimate]:
         """The map."""
@@ -265,6 +278,12 @@ class BeaconSlam:
         """
         if beacon in self._map and (share > 0.0 or self._wander is None):
             self._map[beacon].heard_by(radio).noise = LearnedNoise(variance, GaussMarkovBias(share, inf, lasts_s))
+
+    def take_odometry_noise(self, noise: OdometryNoiseConfig) -> None:
+        """Use this noise of the odometry from now on, and learn none."""
+        if isinstance(self._motion, DifferentialDrive):
+            self._motion.noise = noise
+        self.levels["motion"] = NoiseLevel(0.0, 0.0, 1.0)
 
     def _columns(self, names: Sequence[str], beacons: Sequence[BeaconId]) -> Columns:
         calibration = [POSE + self._names.index(name) for name in names]

@@ -13,7 +13,8 @@ from ccatp.beacons.config.models import FixedLagConfig, PriorsConfig, RecordingC
 from ccatp.beacons.estimation.batch_problem import BeaconNoise
 from ccatp.beacons.estimation.beacon_map import HEADING
 from ccatp.beacons.estimation.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
-from ccatp.beacons.estimation.motion import Increment
+from ccatp.beacons.estimation.motion import POSE, Increment
+from ccatp.beacons.estimation.odometry_noise import OdometryNoise
 from ccatp.beacons.estimation.recording import (
     BeaconFix,
     BeaconId,
@@ -25,7 +26,7 @@ from ccatp.beacons.estimation.recording import (
     RecordedRun,
     Steps,
 )
-from ccatp.beacons.estimation.window import Window
+from ccatp.beacons.estimation.window import Window, excesses
 from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.core import FloatArray
 
@@ -131,8 +132,9 @@ class Followed(NamedTuple):
 
     path: EstimatedPath
     slam: BeaconSlam
-    priors: PriorsConfig  # of the calibration in use
-    noise: BeaconNoise | None  # of the ranges, as estimated; None by the filter alone
+    settings: RecordingConfig  # in use: priors of the calibration, noise of the odometry
+    noise: BeaconNoise  # of the ranges, as estimated; the configured one by the filter alone
+    odometry: OdometryNoise  # factors on the configured noise that are in the settings
 
 
 def follow(
@@ -145,7 +147,7 @@ def follow(
     """
     sigmas = cfg.priors.pose_m, cfg.priors.pose_m, cfg.priors.heading_rad
     window = None if lag is None else Window(run, cfg, how, lag)
-    assumed = cfg if window is None else cfg.model_copy(update={"priors": window.priors})
+    assumed = cfg if window is None else window.settings
     search = HeadingRelocalizer(recorded_slam(assumed, how, run.first_pose, np.diag(np.square(sigmas))))
     if run.known_map is not None:
         search.best.know(run.known_map, _kinds(run))
@@ -166,19 +168,22 @@ def follow(
         poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
         if window is not None:
             window.step(float(times[k]), search.all, times[: k + 1], poses[: k + 1])
-            poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
+            excess = excesses(window.assumed, cfg.priors)
+            poses[k], covariances[k] = search.best.pose, search.best.error_covariance(slice(POSE), excess)
         if run.moving and now:
             log.track({reading.beacon for reading in now}, search.best, float(times[k]))
     delayed = None if window is None else window.delayed(search.best, times, poses, covariances)
-    priors, noise = (cfg.priors, None) if window is None else (window.priors, window.noise)
-    path = _result(run, search.best, log, priors)
+    used, noise, odometry = cfg, BeaconNoise.configured(len(run.beacon_ids) * len(run.radios)), OdometryNoise()
+    if window is not None:
+        used, noise, odometry = window.settings, window.noise, window.odometry
+    path = _result(run, search.best, log, used.priors, {} if window is None else excesses(window.assumed, cfg.priors))
     beyond = beyond_priors(path.calibration, cfg.priors.model_dump(), run.kind)
     found = () if window is None else window.findings()
     path = path._replace(
         times_s=times, poses=poses, covariances=covariances, delayed=delayed,
         warnings=(*path.warnings, *beyond, *found),
     )  # fmt: skip
-    return Followed(path, search.best, priors, noise)
+    return Followed(path, search.best, used, noise, odometry)
 
 
 class _Log:
@@ -208,8 +213,13 @@ class _Log:
             self.scalar_s += [lasted_s / scalars] * scalars
 
 
-def _result(run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig) -> EstimatedPath:
-    """The result without the path, which is empty; ``assumed``: the priors of the calibration in use."""
+def _result(
+    run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig, excess: Mapping[str, tuple[float, float]]
+) -> EstimatedPath:
+    """The result without the path, which is empty.
+
+    ``assumed``: the priors of the calibration in use. ``excess``: as for ``BeaconSlam.error_covariance``.
+    """
     used = [one for one in log.learned if one.accepted]
     refused = len(log.learned) - len(used)
     nis, sizes = np.array([(one.nis, float(one.size)) for one in used]).reshape(-1, 2).T
@@ -223,9 +233,13 @@ def _result(run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig
     for name, until_s, fix in slam.left:
         log.tracks.setdefault(str(name), []).append((until_s, fix.mean[:2], fix.covariance[:2, :2]))
     at = columns_of(*((first := slam.engine.block(name).start, first + 1) for name, _ in beacons))
+    of_map = slam.error_covariance(at, excess)
     return EstimatedPath(
         none, none, none,
-        beacons={str(b): BeaconFix(float(e.mean[0]), float(e.mean[1]), e.covariance[:2, :2]) for b, e in beacons},
+        beacons={
+            str(b): BeaconFix(float(e.mean[0]), float(e.mean[1]), of_map[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])
+            for k, (b, e) in enumerate(beacons)
+        },
         calibration=calibration,
         refused=refused,
         updates=nis.size,
@@ -235,7 +249,7 @@ def _result(run: RecordedRun, slam: BeaconSlam, log: _Log, assumed: PriorsConfig
         update_s=np.array(log.update_s),
         predict_s=np.array(log.predict_s[1:]),
         scalar_s=np.array(log.scalar_s),
-        map_covariance=slam.engine.covariance[np.ix_(at, at)],
+        map_covariance=of_map,
         innovations=tuple(
             ReadingInnovation(
                 time_s, str(one.beacon), one.nis, one.size, one.accepted, one.radio.name if one.radio else ""

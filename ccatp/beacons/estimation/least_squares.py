@@ -1,5 +1,7 @@
 """Least squares of a ``BatchProblem``: Levenberg-Marquardt with Student's t, Cholesky of the arrow-shaped system."""
 
+from copy import copy
+
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
@@ -33,6 +35,20 @@ class Factored:
         corner = system.corner + damping * np.diag(np.diag(system.corner))
         S = corner - system.border.T @ self._border_solved
         self._schur = cho_factor(0.5 * (S + S.T), lower=True, check_finite=False)
+        self._extra = np.zeros((m, 0))
+
+    def spread_by(self, assumed: FloatArray, actual: FloatArray) -> "Factored":
+        """The same factors, with covariances of errors under other priors of the shared unknowns than were assumed.
+
+        ``assumed``, ``actual``: their variances, both (m,); infinite without a prior. The estimate moves by P / assumed
+        with the mean of a prior, so a prior that is too narrow by d adds (P / assumed) d (P / assumed)^T (Schmidt
+        1966). This is much where the readings do not determine the unknown, and next to nothing where they do.
+        """
+        other = copy(self)
+        known = np.isfinite(assumed) & (actual > assumed)
+        weights = np.sqrt(actual[known] - assumed[known]) / assumed[known]
+        other._extra = np.asarray(cho_solve(self._schur, np.eye(len(assumed))[:, known], check_finite=False)) * weights
+        return other
 
     def solution(self) -> tuple[FloatArray, FloatArray]:
         """Step of the poses, shape (n, 3), and of the shared unknowns, shape (m,)."""
@@ -42,7 +58,8 @@ class Factored:
 
     def shared_covariance(self) -> FloatArray:
         """Block of the inverse for the shared unknowns, shape (m, m)."""
-        return np.asarray(cho_solve(self._schur, np.eye(len(self.system.corner)), check_finite=False))
+        own = np.asarray(cho_solve(self._schur, np.eye(len(self.system.corner)), check_finite=False))
+        return np.asarray(own + self._extra @ self._extra.T)
 
     def covariance_at(self, pose: int) -> FloatArray:
         """Block of the inverse for a pose, counted as in an array, and the shared unknowns, shape (3 + m, 3 + m)."""
@@ -55,11 +72,47 @@ class Factored:
         return np.block([[own - across @ W.T, across], [across.T, shared]])
 
     def pose_covariances(self) -> FloatArray:
-        """Diagonal block of the inverse for each pose, (n, 3, 3): (A^-1)_kk + W_k W_k^T, W = A^-1 B chol(S)^-T."""
-        root = np.tril(self._schur[0])
-        shaped = solve_triangular(root, self._border_solved.T, lower=True, check_finite=False).T
-        W = shaped.reshape(-1, POSE, len(root))
-        return np.asarray(_diagonal_of_inverse(self.system.band) + W @ W.transpose(0, 2, 1))
+        """Diagonal block of the inverse for each pose, (n, 3, 3): (A^-1)_kk + W_k W_k^T, W = A^-1 B R."""
+        W = self._shaped(self._border_solved.reshape(-1, POSE, len(self.system.corner)))
+        return np.asarray(self._chain_inverse()[0] + W @ W.transpose(0, 2, 1))
+
+    def step_covariances(self, by_poses: FloatArray, by_shared: FloatArray) -> FloatArray:
+        """J P J^T of linear functions of successive poses and the shared unknowns, shape (n - 1, r, r).
+
+        ``by_poses``: derivatives by poses k and k + 1, (n - 1, r, 6). ``by_shared``: by the shared unknowns, (n - 1, r,
+        m). With P_pp = A^-1 + G S^-1 G^T, P_ps = -G S^-1 and G = A^-1 B it is J A^-1 J^T + M S^-1 M^T, M = J_p G - J_s.
+        """
+        inverse, across = self._chain_inverse()
+        first, second = by_poses[:, :, :POSE], by_poses[:, :, POSE:]
+        mixed = first @ across @ second.transpose(0, 2, 1)
+        chain = first @ inverse[:-1] @ first.transpose(0, 2, 1) + second @ inverse[1:] @ second.transpose(0, 2, 1)
+        G = self._border_solved.reshape(-1, POSE, len(self.system.corner))
+        M = self._shaped(first @ G[:-1] + second @ G[1:] - by_shared)
+        return np.asarray(chain + mixed + mixed.transpose(0, 2, 1) + M @ M.transpose(0, 2, 1))
+
+    def _shaped(self, rows: FloatArray) -> FloatArray:
+        """M R of blocks of rows M, (n, r, m), with R R^T the covariance of the shared unknowns."""
+        flat = rows.reshape(-1, rows.shape[2])
+        solved = solve_triangular(np.tril(self._schur[0]), flat.T, lower=True, check_finite=False).T
+        return np.asarray(np.column_stack([solved, flat @ self._extra]).reshape(*rows.shape[:2], -1))
+
+    def _chain_inverse(self) -> tuple[FloatArray, FloatArray]:
+        """Blocks (k, k), (n, 3, 3), and (k, k + 1), (n - 1, 3, 3), of A^-1, from its Cholesky factor L.
+
+        With G_k = -(L_k+1,k L_kk^-1)^T: (A^-1)_k,k+1 = G_k (A^-1)_k+1,k+1 and (A^-1)_kk = (L_kk L_kk^T)^-1 + G_k
+        (A^-1)_k+1,k+1 G_k^T (Takahashi, Fagan and Chin 1973).
+        """
+        row, column = np.indices((POSE, POSE))
+        start = np.arange(0, self._factor.shape[1], POSE)[:, None, None]
+        lower = np.tril(self._factor[np.abs(row - column), start + column])
+        back = np.linalg.inv(lower)
+        inverse = back.transpose(0, 2, 1) @ back
+        G = -(self._factor[POSE + row - column, start + column][:-1] @ back[:-1]).transpose(0, 2, 1)
+        across = np.empty_like(G)
+        for k in range(len(G) - 1, -1, -1):
+            across[k] = G[k] @ inverse[k + 1]
+            inverse[k] += across[k] @ G[k].T
+        return inverse, across
 
 
 def eliminated(system: ArrowSystem) -> tuple[FloatArray, FloatArray]:
@@ -85,19 +138,6 @@ def eliminated(system: ArrowSystem) -> tuple[FloatArray, FloatArray]:
 def _last_block(band: FloatArray) -> FloatArray:
     row, column = np.indices((POSE, POSE))
     return np.asarray(band[np.abs(row - column), band.shape[1] - POSE + np.minimum(row, column)])
-
-
-def _diagonal_of_inverse(band: FloatArray) -> FloatArray:
-    row, column = np.indices((POSE, POSE))
-    start = np.arange(0, band.shape[1], POSE)[:, None, None]
-    A = band[np.abs(row - column), start + np.minimum(row, column)]
-    below, n = band[POSE + row - column, start + column], len(start)  # blocks (k + 1, k)
-    left, right = A.copy(), A.copy()
-    for k in range(1, n):
-        left[k] -= below[k - 1] @ np.linalg.solve(left[k - 1], below[k - 1].T)
-    for k in range(n - 2, -1, -1):
-        right[k] -= below[k].T @ np.linalg.solve(right[k + 1], below[k])
-    return np.asarray(np.linalg.inv(left + right - A))
 
 
 def t_weights(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: float = 1.0) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from math import copysign, cos, hypot, nan, sin
+from math import copysign, cos, hypot, nan, sin, sqrt
 from typing import Any, NamedTuple
 
 import msgspec
@@ -15,9 +15,11 @@ from ccatp.beacons.config.models import (
     SlamFilterConfig,
     VehicleConfig,
 )
-from ccatp.beacons.estimation.recording import Radio
+from ccatp.beacons.estimation.recording import BoolArray, Radio, running_total
 from ccatp.core import FloatArray
 
+REST_S = 0.1  # over which a motion is slow or not: a step of 5 ms between two ticks of an encoder is no rest
+TINY_S = 1e-6
 POSE = 3  # x_m, y_m, heading_rad: the first states of a vehicle
 SMALL_RAD = 1e-3  # half a turn below which sin(a) / a is 1 - a^2 / 6 to the last digit
 
@@ -83,6 +85,28 @@ def step_variances(noise: OdometryNoiseConfig, way_m: Any, turned_rad: Any, inte
     )
 
 
+def resting(
+    times_s: FloatArray, distance_m: FloatArray, turn_rad: FloatArray, limits: tuple[float, float]
+) -> BoolArray:
+    """Whether each step is at rest, shape (n,): slower than ``limits``, m/s and rad/s, as are the last ``REST_S``.
+
+    ``times_s``: at which the steps begin and end, shape (n + 1,).
+    """
+    ends = np.arange(1, times_s.size)
+    begins = np.searchsorted(times_s, times_s[1:] - REST_S + TINY_S, side="right") - 1
+    found = np.ones(ends.size, dtype=np.bool_)
+    for limit, total in zip(limits, (running_total(distance_m), running_total(turn_rad)), strict=True):
+        for first in (ends - 1, np.clip(begins, 0, ends - 1)):
+            found &= np.abs(total[ends] - total[first]) < limit * (times_s[ends] - times_s[first])
+    return found
+
+
+def scaled_noise(noise: OdometryNoiseConfig, variances: Mapping[str, float]) -> OdometryNoiseConfig:
+    """The noise with the variances of ``distance``, ``turn`` and ``lateral`` multiplied by factors."""
+    keys = {name: name.split("_per_")[0] for name in OdometryNoiseConfig.model_fields}
+    return noise.model_copy(update={name: getattr(noise, name) * sqrt(variances[of]) for name, of in keys.items()})
+
+
 def _increment(odometry: Odometry) -> Increment:
     if not isinstance(odometry, Increment):
         raise TypeError(f"a differential drive takes increments, not {type(odometry).__name__}")
@@ -105,12 +129,13 @@ class DifferentialDrive:
     """
 
     def __init__(self, noise: OdometryNoiseConfig, priors: PriorsConfig, how: SlamFilterConfig) -> None:
-        self._noise, self._how = noise, how
+        self.noise, self._how = noise, how
         calibrated = ("turn_bias_rad_s", "turn_scale", "distance_scale", "distance_per_rad")
         self.names, self.prior_sigmas = estimated({name: getattr(priors, name) for name in calibrated})
         place = {name: POSE + i for i, name in enumerate(self.names)}
         self._bias, self._turn_scale, self._way_scale, self._lost = (place.get(name, -1) for name in calibrated)
         size = POSE + len(self.names)
+        self._is_at_rest, self._recent = False, deque[Increment]()
         self._F, self._Q = np.eye(size), np.zeros((size, size))
 
     def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
@@ -121,7 +146,7 @@ class DifferentialDrive:
         scaled_way, side = odometry.distance_m / scaled, odometry.lateral_m / scaled
         lost = turned_way(odometry.distance_m, odometry.turn_rad) if self._lost >= 0 else 0.0
         way = scaled_way - lost * values[self._lost]
-        is_at_rest = self._bias >= 0 and self._rests(odometry)
+        self._is_at_rest = is_at_rest = self._bias >= 0 and self._rests(odometry)
         turn, by_bias, by_scale = (0.0, 0.0, 0.0) if is_at_rest else self._turn(values, odometry)
         half = 0.5 * turn
         chord = 1.0 - half * half / 6.0 if abs(half) < SMALL_RAD else sin(half) / half
@@ -145,18 +170,30 @@ class DifferentialDrive:
         return MotionStep(mean, F, Q)
 
     def at_rest(self, odometry: Odometry) -> tuple[int, float, float] | None:
-        """Column, value and variance of a measurement of the bias by the turn at rest; None while the vehicle drives.
+        """Column, value and variance of a measurement of the bias by the turn of the last step; None if it drives.
 
         The noise is the gyroscope's angle random walk.
         """
-        if self._bias < 0 or not isinstance(odometry, Increment) or not self._rests(odometry):
+        if not self._is_at_rest or not isinstance(odometry, Increment):
             return None
         dt = odometry.interval_s
-        return self._bias, odometry.turn_rad / dt, self._noise.turn_per_sqrt_s**2 / dt
+        return self._bias, odometry.turn_rad / dt, self.noise.turn_per_sqrt_s**2 / dt
 
     def _rests(self, odometry: Increment) -> bool:
-        dt, how = odometry.interval_s, self._how
-        return abs(odometry.distance_m) < how.rest_speed_m_s * dt and abs(odometry.turn_rad) < how.rest_turn_rad_s * dt
+        """As ``resting``, of the newest step."""
+        recent, how = self._recent, self._how
+        recent.append(odometry)
+        dt = sum(one.interval_s for one in recent)
+        while len(recent) > 1 and dt - recent[0].interval_s > REST_S - TINY_S:
+            dt -= recent.popleft().interval_s
+        way = abs(sum(one.distance_m for one in recent)), abs(odometry.distance_m)
+        turn = abs(sum(one.turn_rad for one in recent)), abs(odometry.turn_rad)
+        return (
+            way[0] < how.rest_speed_m_s * dt
+            and turn[0] < how.rest_turn_rad_s * dt
+            and way[1] < how.rest_speed_m_s * odometry.interval_s
+            and turn[1] < how.rest_turn_rad_s * odometry.interval_s
+        )
 
     def _turn(self, values: list[float], odometry: Increment) -> tuple[float, float, float]:
         scaled = 1.0 + values[self._turn_scale] if self._turn_scale >= 0 else 1.0
@@ -169,7 +206,7 @@ class DifferentialDrive:
         turning: float,
     ) -> FloatArray:  # fmt: skip
         way, dt = hypot(odometry.distance_m, odometry.lateral_m), odometry.interval_s
-        var_way, var_turn, var_side = step_variances(self._noise, way, abs(odometry.turn_rad), dt)
+        var_way, var_turn, var_side = step_variances(self.noise, way, abs(odometry.turn_rad), dt)
         var_turn *= turning
         (c, s), (tx, ty) = direction, by_turn
         ax, ay = chord * c, chord * s

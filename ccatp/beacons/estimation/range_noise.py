@@ -9,23 +9,29 @@ from ccatp.beacons.estimation.measurement_models import range_variance
 from ccatp.core import FloatArray
 
 FEWEST = 20  # readings of a beacon from which its noise is estimated
+SPANS = 5.0  # correlation times of the errors that readings must span: in a shorter time such errors look constant
 ASSUMED = 10.0  # number of independent readings for which the configured noise counts
-LEAST = 0.25  # smallest factor on the configured variance
+LEAST = 0.04  # smallest factor on the configured variance
 CLIPPED = 3.0  # standard deviations at which residuals are cut off: outliers are no errors that last
 SURE = 2.0  # standard deviations of a correlation by chance, above which it counts
 MOST_SHARE, LONGEST = 0.95, 0.995  # of the variance that lasts; correlation of successive readings
 SCALINGS = 10  # iterations of the scale of Student's t
 
 
-def range_noise(problem: BatchProblem, state: BatchState, radios: int = 1) -> BeaconNoise:
-    """The noise of each beacon by each radio; the configured one where there are too few readings."""
-    noise = BeaconNoise.configured(problem.used.size * radios)
+def range_noise(problem: BatchProblem, state: BatchState, before: BeaconNoise) -> BeaconNoise:
+    """The noise of each beacon by each radio.
+
+    The noise as it was before where there are too few readings, or in too short a time.
+    """
+    noise = BeaconNoise(*(column.copy() for column in before))
     off_m = problem.residuals(state).readings[:, 0]
     sigmas = np.sqrt(range_variance(problem.radio, problem.readings.range_m))
     for heard in range(len(noise.variance)):
         rows = np.flatnonzero((problem.heard == heard) & problem.there[:, 0])
-        if rows.size < FEWEST:
+        times_s = problem.readings.times_s[rows]
+        if rows.size < FEWEST or times_s[-1] - times_s[0] < SPANS * before.lasts_s[heard]:
             continue
+        noise.repeats[heard], noise.share[heard], noise.lasts_s[heard] = 1.0, 0.0, 1.0
         e = off_m[rows] / sigmas[rows]
         square = _scale(e, problem.radio.freedom)
         rho = correlations(np.clip(e / np.sqrt(square), -CLIPPED, CLIPPED))
@@ -34,7 +40,7 @@ def range_noise(problem: BatchProblem, state: BatchState, radios: int = 1) -> Be
             # rho_k = share phi^k, whose sum over k is share phi / (1 - phi)
             phi = min(max(1.0 - 2.0 * float(rho[1]) / max(repeats - 1.0, 1e-9), 0.1), LONGEST)
             noise.share[heard] = min(float(rho[1]) / phi, MOST_SHARE)
-            noise.lasts_s[heard] = -float(np.median(np.diff(problem.readings.times_s[rows]))) / log(phi)
+            noise.lasts_s[heard] = -float(np.median(np.diff(times_s))) / log(phi)
         count = rows.size / noise.repeats[heard]
         noise.variance[heard] = max((ASSUMED + count * square) / (ASSUMED + count), LEAST)
     return noise

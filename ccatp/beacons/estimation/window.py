@@ -29,6 +29,7 @@ from ccatp.beacons.estimation.batch_problem import (
 from ccatp.beacons.estimation.beacon_slam import BeaconSlam
 from ccatp.beacons.estimation.least_squares import Factored, descend, eliminated, t_weights
 from ccatp.beacons.estimation.motion import POSE
+from ccatp.beacons.estimation.odometry_noise import OdometryNoise, odometry_noise
 from ccatp.beacons.estimation.range_noise import range_noise
 from ccatp.beacons.estimation.recording import BeaconId, BoolArray, DelayedPath, RecordedRun, Steps
 from ccatp.core import FloatArray
@@ -44,6 +45,9 @@ EARLIER_S = 2.0  # of odometry before the window, for its delay
 
 
 FREEDOM = 8.0  # of Student's t of a calibration: one of several cores costs less than a Gaussian would take
+# Standard deviation of a calibration among instruments, as a share of the prior, which is that of the worst ones.
+# Covariances are those of errors with this spread, though the estimate assumes the core, which is narrower.
+USUAL = 0.5
 # Levels are left out: the spread of transmitters is no fault of an instrument.
 INSTRUMENTAL = (*CALIBRATION, "range_scale", "range_offset_m", "bearing_offset_rad")
 
@@ -62,6 +66,19 @@ def reweighted(priors: PriorsConfig, squares: Mapping[str, float]) -> PriorsConf
     return priors.model_copy(update=sigmas)
 
 
+def excesses(assumed: PriorsConfig, configured: PriorsConfig) -> dict[str, tuple[float, float]]:
+    """Variances of the priors that were assumed, and those of instruments, by name."""
+    return {name: (getattr(assumed, name) ** 2, (USUAL * getattr(configured, name)) ** 2) for name in INSTRUMENTAL}
+
+
+def spread_by_priors(factored: Factored, problem: BatchProblem, configured: PriorsConfig) -> Factored:
+    """The factors with the covariances of errors among instruments."""
+    variances = np.full((2, problem.free.size), np.inf)
+    for name, found in excesses(problem.priors, configured).items():
+        variances[:, SHARED.index(name)] = found
+    return factored.spread_by(*variances[:, problem.free])
+
+
 class _Solved(NamedTuple):
     problem: BatchProblem
     state: BatchState
@@ -72,7 +89,8 @@ class _Solved(NamedTuple):
 class Window:
     """Solves the window and corrects a ``BeaconSlam``; ``delayed`` is the path as estimated ``lag_s`` later.
 
-    ``noise``: of the ranges, as estimated from the last solution.
+    ``assumed``: the priors of the calibration in the filter's estimate. ``noise``: of the ranges, and ``odometry``:
+    factors on that of the odometry, as estimated from the last solution.
     """
 
     def __init__(self, run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, lag: FixedLagConfig) -> None:
@@ -90,7 +108,9 @@ class Window:
         self._seen: tuple[object, ...] = (0, 0)
         self.noise = BeaconNoise.configured(len(run.beacon_ids) * len(run.radios))
         self._places = None if run.known_map is None else PlacePrior.of_run(run, run.beacon_ids)
-        self._configured, self._cfg = cfg.priors, cfg.model_copy(update={"priors": reweighted(cfg.priors, {})})
+        self._configured, self._cfg = cfg, cfg.model_copy(update={"priors": reweighted(cfg.priors, {})})
+        self.odometry = self._odometry_before = OdometryNoise()
+        self.assumed = self._cfg.priors
         self._due_s, self._placed = self._begin_s, frozenset[str]()
         self._delayed = list[tuple[float, FloatArray, FloatArray]]()
 
@@ -125,10 +145,11 @@ class Window:
             return
         for name in likely:
             slam.join(name, solved.state.beacons[self._run.beacon_ids.index(str(name)), :2])
-        self._last = solved
+        self._last, self.assumed = solved, solved.problem.priors
         self._correct(slam, solved, time_s)
-        self._reweight(solved)
-        self.noise = range_noise(solved.problem, solved.state, len(self._run.radios))
+        self._learn(solved)
+        slam.take_odometry_noise(self._cfg.odometry)
+        self.noise = range_noise(solved.problem, solved.state, self.noise)
         for k, (radio, name) in enumerate(product(self._run.radios, self._run.beacon_ids)):
             slam.take_noise(name, radio, *(float(column[k]) for column in (self.noise.variance, *self.noise[2:])))
         self._hand_over(time_s - self._lag.lag_s)
@@ -152,9 +173,13 @@ class Window:
         return DelayedPath(self._lag.lag_s, *map(np.array, zip(*early, *self._delayed, strict=True)))
 
     @property
-    def priors(self) -> PriorsConfig:
-        """The priors in use: Gaussian, with the weights of Student's t at the calibration of the last solution."""
-        return self._cfg.priors
+    def settings(self) -> RecordingConfig:
+        """The settings in use.
+
+        The priors are Gaussian, with the weights of Student's t at the calibration of the last solution; the noise of
+        the odometry is that estimated from it.
+        """
+        return self._cfg
 
     def findings(self) -> Iterator[str]:
         """What was found of the noise, and what was done about it."""
@@ -237,13 +262,15 @@ class Window:
         values = np.concatenate([solved.state.poses[-1], solved.state.shared, solved.state.beacons.ravel()])
         slam.replace(time_s, names, [self._run.beacon_ids[k] for k in placed], values[rows], whole[np.ix_(rows, rows)])
 
-    def _reweight(self, solved: _Solved) -> None:
-        """Give the prior of each calibration its weight at this solution."""
+    def _learn(self, solved: _Solved) -> None:
+        """Give the prior of each calibration its weight at this solution, and estimate the noise of the odometry."""
         free = np.flatnonzero(solved.problem.free[: len(SHARED)])
         variances = solved.factored.shared_covariance().diagonal()[: free.size]
         squares = (solved.state.shared[free] ** 2 + variances).tolist()
-        priors = reweighted(self._configured, dict(zip([SHARED[k] for k in free], squares, strict=True)))
-        self._cfg = self._cfg.model_copy(update={"priors": priors})
+        priors = reweighted(self._configured.priors, dict(zip([SHARED[k] for k in free], squares, strict=True)))
+        self.odometry = odometry_noise(*solved[:3], self._configured.odometry, self.odometry, self._odometry_before)
+        odometry = self.odometry.of(self._configured.odometry)
+        self._cfg = self._cfg.model_copy(update={"priors": priors, "odometry": odometry})
 
     def _marginalise(self, before_s: float) -> None:
         """Keep what the readings up to a pose of the window tell as a prior, and begin there."""
@@ -275,6 +302,7 @@ class Window:
     def _restart(self, time_s: float, slam: BeaconSlam) -> None:
         """Begin a window now, with the filter's estimate as its prior."""
         self._hand_over(np.inf)
+        self._odometry_before = self.odometry
         used = self._stands & [name in slam.beacons for name in self._run.beacon_ids]
         names, placed = list(slam.calibration), np.flatnonzero(used).tolist()
         shared, beacons = np.zeros(len(SHARED)), np.zeros((len(used), BEACON))
@@ -291,7 +319,7 @@ class Window:
         information[np.ix_(rows, rows)] = np.linalg.inv(P)
         # The filter's calibration and known places have priors, which stay where they are.
         assumed, side, own = np.zeros((size, size)), np.zeros(size), rows[POSE : POSE + len(names)]
-        assumed[own, own] = of_priors(self._cfg.priors, used)[1][np.array(own, dtype=int) - POSE]
+        assumed[own, own] = of_priors(self.assumed, used)[1][np.array(own, dtype=int) - POSE]
         values = np.concatenate([shared, beacons.ravel()])
         side[POSE:] = assumed.diagonal()[POSE:] * values
         if self._places is not None:  # a beacon that was removed is not where it was surveyed
@@ -311,9 +339,10 @@ class Window:
         last = self._last
         if last is None:
             return
+        factored = spread_by_priors(last.factored, last.problem, self._configured.priors)
         for k, time_s in enumerate(last.times_s.tolist()):
             if time_s > until_s:
                 return
             if not self._delayed or time_s >= self._delayed[-1][0] + self._spacing_s:
-                covariance = last.factored.covariance_at(k)[:POSE, :POSE]
+                covariance = factored.covariance_at(k)[:POSE, :POSE]
                 self._delayed.append((time_s, last.state.poses[k].copy(), covariance))

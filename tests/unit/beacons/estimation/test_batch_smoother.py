@@ -158,6 +158,36 @@ def test_solution_and_covariances_are_those_of_the_full_matrix() -> None:
         assert covariance == pytest.approx(C[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rel=1e-6, abs=1e-12)
 
 
+def test_covariances_of_steps_are_those_of_the_full_matrix() -> None:
+    made, state = problem()
+    A, _ = dense(made, state, np.ones(6))
+    factored = Factored(made.normal_equations(state, np.ones(6)))
+    n, m, rng = len(state.poses), len(A) - state.poses.size, np.random.default_rng(8)
+    by_poses, by_shared = rng.standard_normal((n - 1, 2, 6)), rng.standard_normal((n - 1, 2, m))
+    found, C = factored.step_covariances(by_poses, by_shared), np.linalg.inv(A)
+    for k in range(n - 1):
+        J = np.zeros((2, len(A)))
+        J[:, 3 * k : 3 * k + 6], J[:, 3 * n :] = by_poses[k], by_shared[k]
+        assert found[k] == pytest.approx(J @ C @ J.T, rel=1e-6, abs=1e-12)
+
+
+def test_errors_under_another_prior_are_those_of_the_estimate_that_assumes_the_first() -> None:
+    """P' = P (A - 1 / assumed + actual / assumed^2) P for one unknown: covariance of P (J^T W z + prior)."""
+    made, state = problem()
+    A, _ = dense(made, state, np.ones(6))
+    factored, n = Factored(made.normal_equations(state, np.ones(6))), state.poses.size
+    assumed, actual = np.full(len(A) - n, np.inf), np.full(len(A) - n, np.inf)
+    assumed[1], actual[1] = 1.0 / made.prior_information[1], 9.0 / made.prior_information[1]
+    middle, C = A.copy(), np.linalg.inv(A)
+    middle[n + 1, n + 1] += actual[1] / assumed[1] ** 2 - 1.0 / assumed[1]
+    expected = C @ middle @ C
+    found = factored.spread_by(assumed, actual)
+    assert found.shared_covariance() == pytest.approx(expected[n:, n:], rel=1e-6, abs=1e-12)
+    for k, covariance in enumerate(found.pose_covariances()):
+        assert covariance == pytest.approx(expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rel=1e-6, abs=1e-12)
+        assert found.covariance_at(k)[:3, :3] == pytest.approx(covariance, rel=1e-6, abs=1e-12)
+
+
 def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
     made, state = problem()
     system = made.normal_equations(state, np.ones(6))

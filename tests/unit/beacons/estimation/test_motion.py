@@ -12,7 +12,7 @@ from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import ScanConfig
 from ccatp.beacons.estimation.causal import filter_run
 from ccatp.beacons.estimation.evaluation import judge
-from ccatp.beacons.estimation.motion import Increment
+from ccatp.beacons.estimation.motion import Increment, resting
 from ccatp.beacons.estimation.recording import EstimatedPath, Readings, RecordedRun
 from ccatp.beacons.estimation.signal_slam import ReflectorScan
 from ccatp.core import FloatArray
@@ -67,7 +67,26 @@ def test_a_turn_at_rest_is_the_bias_and_turns_nothing() -> None:
     still = Increment(0.1, 0.1, 0.0, -7e-4)
     assert drive.step(x, still).mean == pytest.approx(x)
     assert drive.at_rest(still) == pytest.approx((3, -7e-3, 0.002**2 / 0.1))
-    assert drive.at_rest(Increment(0.1, 0.1, 0.01, -7e-4)) is None
+    slow = Increment(0.2, 0.1, 0.01, -7e-4)
+    assert drive.step(x, slow).mean[0] > x[0]
+    assert drive.at_rest(slow) is None
+
+
+def test_steps_between_the_ticks_of_an_encoder_are_no_rest() -> None:
+    """0.1 m/s at 200 Hz, in ticks of a millimetre, then two seconds of rest: filter and smoother see the same."""
+    drive, how = CALIBRATED.drive, CALIBRATED.how
+    t: FloatArray = 0.005 * np.arange(801, dtype=np.float64)
+    distance_m = np.diff(1e-3 * np.floor(np.minimum(0.1 * t, 0.2) / 1e-3 + 1e-9))
+    turn_rad = np.full(800, 1e-5)
+    found = resting(t, distance_m, turn_rad, (how.rest_speed_m_s, how.rest_turn_rad_s))
+    x, seen = np.array((1.0, 2.0, 0.3, 0.0, 0.0, 0.0, 0.0)), list[bool]()
+    for end_s, way_m, turned_rad in zip(t[1:].tolist(), distance_m.tolist(), turn_rad.tolist(), strict=True):
+        step = Increment(end_s, 0.005, way_m, turned_rad)
+        drive.step(x, step)
+        seen.append(drive.at_rest(step) is not None)
+    assert not found[20:400].any()
+    assert found[440:].all()
+    assert found.tolist() == seen
 
 
 def track_of(run: RecordedRun) -> EstimatedPath:

@@ -40,7 +40,7 @@ def test_an_estimate_that_dead_reckoning_beats_gives_a_warning() -> None:
     wander = 1.0 * np.sin(np.arange(len(track.times_s)) / 20.0)[:, None]
     lost = track._replace(poses=track.poses + wander * (1.0, 1.0, 0.0))
     (warning,) = prediction_doubts(predicted(run, lost, 0.0))
-    assert "dead reckoning on the same map" in warning
+    assert "dead reckoning on its own map" in warning
 
 
 def test_too_few_ranges_say_nothing() -> None:
