@@ -79,7 +79,7 @@ def test_each_part_is_found_larger_and_smaller_and_the_others_stay(part: str, fa
 
 def test_what_the_readings_do_not_tell_stays_as_configured() -> None:
     run = driven(1, OdometryNoise(0.05, 0.05, 0.05))
-    few = replace(run, readings=run.readings.where(np.arange(len(run.readings.times_s)) % 60 == 0))
+    few = replace(run, readings=run.readings.where(np.arange(len(run.readings.times_s)) % 37 == 0))
     assert list(found_in(few)) == pytest.approx([1.0, 1.0, 1.0], abs=0.4)
 
 

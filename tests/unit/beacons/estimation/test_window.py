@@ -7,12 +7,12 @@ import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import FixedLagConfig
-from ccatp.beacons.estimation.batch_problem import BEACON, SHARED, BatchState, MarginalPrior
+from ccatp.beacons.estimation.batch_problem import BEACON, SHARED, BatchState, BeaconNoise, MarginalPrior
 from ccatp.beacons.estimation.batch_smoother import smooth
 from ccatp.beacons.estimation.causal import filter_run, follow
 from ccatp.beacons.estimation.evaluation import judge
 from ccatp.beacons.estimation.least_squares import Factored, eliminated
-from ccatp.beacons.estimation.range_noise import correlations, readings_as_one
+from ccatp.beacons.estimation.range_noise import correlations, range_noise, readings_as_one
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.estimation.window import reweighted
 from ccatp.beacons.filters.ekf_slam import EkfSlam
@@ -194,6 +194,14 @@ def test_a_part_that_is_replaced_takes_the_rest_along_as_an_update_of_it_does() 
     replaced.replace(columns, updated.mean[columns], updated.covariance[at])
     assert replaced.mean == pytest.approx(updated.mean)
     assert replaced.covariance == pytest.approx(updated.covariance)
+
+
+def test_the_noise_of_a_beacon_with_few_readings_stays_what_it_was() -> None:
+    """So after a restart of the window errors that last are not taken for white ones."""
+    made, state = problem()
+    before = BeaconNoise(np.array((2.0, 0.5)), np.array((7.0, 1.0)), np.array((0.8, 0.0)), np.array((3.0, 1.0)))
+    for found, kept in zip(range_noise(made, state, before), before, strict=True):
+        assert found == pytest.approx(kept)
 
 
 @pytest.mark.parametrize(("phi", "expected"), [(0.0, 1.0), (0.8, 9.0), (0.95, 39.0)])
