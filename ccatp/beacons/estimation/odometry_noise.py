@@ -22,7 +22,10 @@ from ccatp.beacons.estimation.motion import POSE, scaled_noise
 from ccatp.core import FloatArray
 
 ASSUMED = 10.0  # number of independent errors of odometry for which the configured noise counts
-LEAST, MOST = 1e-3, 1e3  # factors beyond which an instrument is not what it was configured as
+LEAST = 1e-3  # smallest factor
+# Largest factor: errors of ranges that last (heights, an antenna off the vehicle's middle) look like motion, too, and then
+# the path follows the readings. Without a limit such runs end at factors of 40 to 300 and a NEES above 40.
+MOST = 2.0
 
 
 class OdometryNoise(NamedTuple):

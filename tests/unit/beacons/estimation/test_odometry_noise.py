@@ -1,4 +1,4 @@
-"""Noise of the odometry, estimated: each part alone, larger and smaller than configured, and what it changes."""
+"""Noise of the odometry, estimated: each part alone, larger and smaller than configured."""
 
 from dataclasses import replace
 
@@ -7,10 +7,9 @@ import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.estimation.batch_problem import BEACON, SHARED, BatchProblem, BatchState
-from ccatp.beacons.estimation.batch_smoother import smooth
-from ccatp.beacons.estimation.evaluation import judge, truth_at
+from ccatp.beacons.estimation.evaluation import truth_at
 from ccatp.beacons.estimation.least_squares import Factored, descend
-from ccatp.beacons.estimation.odometry_noise import OdometryNoise, odometry_noise
+from ccatp.beacons.estimation.odometry_noise import MOST, OdometryNoise, odometry_noise
 from ccatp.beacons.estimation.recording import RecordedRun, Steps
 from tests.unit.beacons.datasets.sets import recorded, world
 
@@ -23,11 +22,6 @@ RIGHT = CONFIG.csv.model_copy(
         "priors": CONFIG.csv.priors.model_copy(update=dict.fromkeys(SHARED, 0.0)),
     }
 )
-
-
-def no_clock() -> float:
-    """Time stands still."""
-    return 0.0
 
 
 def driven(
@@ -72,22 +66,12 @@ def test_each_part_is_found_larger_and_smaller_and_the_others_stay(part: str, fa
         if name != part:
             assert 0.6 < value < 1.7, name
         elif factor > 1.0:
-            assert 10.0 < value < 30.0
+            assert value == pytest.approx(MOST, rel=0.05)
         else:  # the prior counts for ten errors; a lateral error looks like one of turning
             assert value < (0.75 if part == "lateral" else 0.5)
 
 
 def test_what_the_readings_do_not_tell_stays_as_configured() -> None:
     run = driven(1, OdometryNoise(0.05, 0.05, 0.05))
-    few = replace(run, readings=run.readings.where(np.arange(len(run.readings.times_s)) % 37 == 0))
-    assert list(found_in(few)) == pytest.approx([1.0, 1.0, 1.0], abs=0.4)
-
-
-def test_the_smoother_is_better_and_consistent_with_odometry_that_is_much_worse_than_configured() -> None:
-    found = []
-    for seed in (1, 2, 3):
-        run = driven(seed, OdometryNoise(25.0, 25.0, 25.0), 0.1, 0.05)
-        judged = judge(smooth(run, CONFIG.csv, CONFIG.filter, no_clock), run)
-        assert judged.nees is not None
-        found.append(judged.nees.mean)
-    assert 0.3 < np.mean(found) < 2.0
+    few = replace(run, readings=run.readings.where(np.arange(len(run.readings.times_s)) % 149 == 0))
+    assert list(found_in(few)) == pytest.approx([1.0, 1.0, 1.0], abs=0.2)
