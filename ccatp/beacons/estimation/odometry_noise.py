@@ -23,8 +23,8 @@ from ccatp.core import FloatArray
 
 ASSUMED = 10.0  # number of independent errors of odometry for which the configured noise counts
 LEAST = 1e-3  # smallest factor
-# Largest factor: errors of ranges that last (heights, an antenna off the vehicle's middle) look like motion, too, and then
-# the path follows the readings. Without a limit such runs end at factors of 40 to 300 and a NEES above 40.
+# Largest factor: errors of ranges that last (heights, an antenna off the vehicle's middle) look like motion, too, and
+# then the path follows the readings. Without a limit such runs end at factors of 40 to 300 and a NEES above 40.
 MOST = 2.0
 
 
