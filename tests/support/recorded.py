@@ -274,6 +274,7 @@ def record_beacons(run_dir: Path, cfg: RadioConfig | None = None, *, is_sim: boo
     (run_dir / "log.jsonl").write_text(
         '{"process":"supervisor","event":"run","level":"info","wall":"2026-11-22T05:00:00Z"}\n'
         '{"process":"main","event":"held: <b>near</b>","level":"warning","wall":"2026-11-22T05:00:01Z","t_s":0.7}\n'
+        + ('{"process":"supervisor","event":"end","level":"info","wall":"2026-11-22T05:00:09Z"}\n' if ends else "")
     )
     if ends:
         (run_dir / "summary.json").write_text(
