@@ -45,7 +45,10 @@ def test_a_cause_of_another_version_is_shown_with_its_name_and_its_values() -> N
 # Numbers in a text that stays while the condition lasts: limits, and measured values of what happened once.
 LIMITS = {"limit_s", "limit_ms", "budget_s", "time_s", "least"}
 EVENTS = {"late_ms", "charge", "x_m", "y_m", "v_m_s", "omega_rad_s", "distance_m", "ratio", "ms"}
-COUNTED = {"back_offs", "measurements_failed", "laser_not_following"}  # faults: nothing is counted after them
+# Faults: nothing is counted after them.
+COUNTED = {
+    "back_offs", "measurements_failed", "laser_not_following", "target_lost", "map_stalled", "readings_refused",
+}  # fmt: skip
 RENEWED = {"sensor_much_too_slow", "sensor_too_slow", "metrology_unreliable"}  # found again, with its new number
 
 

@@ -25,7 +25,6 @@ from ccatp.beacons.estimation.batch_problem import (
     SHARED,
     BatchProblem,
     BatchState,
-    BeaconNoise,
     PlacePrior,
 )
 from ccatp.beacons.estimation.causal import Followed, beyond_priors, follow
@@ -33,7 +32,6 @@ from ccatp.beacons.estimation.evaluation import aligned_beacons
 from ccatp.beacons.estimation.landmark_init import LEAST
 from ccatp.beacons.estimation.least_squares import WELL_CONVERGED, Factored, descend, t_weights
 from ccatp.beacons.estimation.odometry_noise import OdometryNoise, odometry_noise
-from ccatp.beacons.estimation.range_noise import range_noise
 from ccatp.beacons.estimation.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun, Steps
 from ccatp.beacons.estimation.window import spread_by_priors
 from ccatp.beacons.filters.ekf_slam import columns_of
@@ -46,7 +44,7 @@ ROUGH_ITERATIONS, ROUGHLY = 6, 1e-3
 ITERATIONS = 40
 ESTIMATES = 8  # of the noise
 WIDER = 1.05  # the noise is increased if the residuals exceed it by this factor
-CLOSE = 0.1  # relative change of the variances of ranges and odometry at which they have converged
+CLOSE = 0.1  # relative change of the variances of the odometry at which they have converged
 NOISY = 4.0  # largest increase of the noise without a warning
 LITTLE = 0.1  # a reading with a smaller weight counts as refused
 
@@ -159,9 +157,9 @@ def smooth(
     if run.known_map is not None:
         places = PlacePrior.of_run(run, [name for name in run.beacon_ids if name not in removed])
 
-    def problem_of(settings: RecordingConfig, noise: BeaconNoise) -> BatchProblem:
+    def problem_of(settings: RecordingConfig) -> BatchProblem:
         return BatchProblem(
-            run.steps, readings, times_s, run.first_pose, settings, start.used, rest, noise=noise, places=places
+            run.steps, readings, times_s, run.first_pose, settings, start.used, rest, noise=found.noise, places=places
         )  # fmt: skip
 
     fit = _fitted(problem_of, start.state, found, settings.odometry)
@@ -183,7 +181,10 @@ def smooth(
     calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)))
     priors = {name: getattr(problem.priors, name) for name in SHARED}
     warnings = [*_warnings(run, start, fit.converged), *beyond_priors(calibration, priors, run.kind)]
-    warnings += _noise_warnings(problem.radio, settings.radio, fit.noise.variance)
+    for what, name in (("range", "range_sigma_m"), ("bearing", "bearing_sigma_rad"), ("rssi", "rssi_sigma_db")):
+        if (ratio := getattr(problem.radio, name) / getattr(settings.radio, name)) > NOISY:
+            much = f"{ratio:.1f} times as noisy as assumed"
+            warnings.append(f"{what} readings are {much}: beacons exchanged or moved on the way?")
     return EstimatedPath(
         times_s, state.poses, factored.pose_covariances(), beacons, calibration, updates=updates,
         refused=int((weights[counted] < LITTLE).sum()), update_s=np.array([took_s / max(updates, 1)]),
@@ -198,43 +199,30 @@ class _Fit(NamedTuple):
     state: BatchState
     factored: Factored
     converged: bool
-    noise: BeaconNoise
 
 
 def _fitted(
-    problem_of: Callable[[RecordingConfig, BeaconNoise], BatchProblem], state: BatchState, found: Followed,
+    problem_of: Callable[[RecordingConfig], BatchProblem], state: BatchState, found: Followed,
     configured: OdometryNoiseConfig,
 ) -> _Fit:  # fmt: skip
     """Solve with the noise that is known, estimate the noise from the residuals, and solve again until it is stable."""
-    settings, noise, odometry = found.settings, found.noise, found.odometry
-    problem = problem_of(settings, noise)
+    settings, odometry = found.settings, found.odometry
+    problem = problem_of(settings)
     counted = problem.sizes > 0
     off = problem.residuals(state).chi2[counted] / problem.sizes[counted]
     if counted.any() and (softness := float(np.median(off))) > FAR_OFF:
         state, _ = descend(problem, state, ROUGH_ITERATIONS, softness, enough=ROUGHLY)
     state, converged = descend(problem, state, ITERATIONS, enough=WELL_CONVERGED)
     for _ in range(ESTIMATES):
-        factored, before = _factored(problem, state), (noise.variance, noise.repeats, np.array(odometry))
-        if settings.radio.correlation_s == 0.0:  # otherwise readings that share their error are counted as configured
-            noise = range_noise(problem, state, noise)
+        factored, before = _factored(problem, state), odometry
         odometry = odometry_noise(problem, state, factored, configured, odometry, OdometryNoise())
-        radio, after = _widened(problem, state), (noise.variance, noise.repeats, np.array(odometry))
-        is_close = all(np.allclose(a, b, rtol=CLOSE, atol=0.0) for a, b in zip(before, after, strict=True))
-        if is_close and radio == problem.radio:
+        radio = _widened(problem, state)
+        if radio == problem.radio and np.allclose(before, odometry, rtol=CLOSE, atol=0.0):
             break
         settings = settings.model_copy(update={"radio": radio, "odometry": odometry.of(configured)})
-        problem = problem_of(settings, noise)
+        problem = problem_of(settings)
         state, converged = descend(problem, state, ITERATIONS)
-    return _Fit(problem, state, _factored(problem, state), converged, noise)
-
-
-def _noise_warnings(radio: RadioNoiseConfig, configured: RadioNoiseConfig, variances: FloatArray) -> Iterator[str]:
-    of_ranges = float(np.sqrt(variances.mean())) if variances.size else 1.0
-    for what, name in (("range", "range_sigma_m"), ("bearing", "bearing_sigma_rad"), ("rssi", "rssi_sigma_db")):
-        ratio = getattr(radio, name) / getattr(configured, name) * (of_ranges if what == "range" else 1.0)
-        if ratio > NOISY:
-            much = f"{ratio:.1f} times as noisy as assumed"
-            yield f"{what} readings are {much}: beacons exchanged or moved on the way?"
+    return _Fit(problem, state, _factored(problem, state), converged)
 
 
 def _factored(problem: BatchProblem, state: BatchState) -> Factored:
