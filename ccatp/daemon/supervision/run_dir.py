@@ -231,16 +231,18 @@ def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> Non
 
 
 def with_origin(options: RunOptions) -> RunOptions:
-    """The options with ``sim`` as the resumed run began, and in real time if it began so.
+    """The options with ``sim`` and ``realtime`` as the resumed run began.
 
-    ConfigError: it began with a real robot, and a simulation is requested.
+    ConfigError: it began with a real robot, and a simulation is requested; or in lockstep, and real time is requested.
     """
     if not options.resume or options.run_dir is None or (began := _began_simulated(options.run_dir)) is None:
         return options
     if options.sim and not began:
         raise ConfigError(f"--sim: the run in {options.run_dir} is of a real robot; leave --sim out to resume it")
-    was_realtime = _read_origin(options.run_dir).get("realtime") is True
-    return replace(options, sim=began, realtime=options.realtime or was_realtime)
+    was_realtime = _read_origin(options.run_dir).get("realtime", options.realtime)  # older versions do not say
+    if options.realtime and not was_realtime:
+        raise ConfigError(f"--realtime: the run in {options.run_dir} began without it; leave it out to resume the run")
+    return replace(options, sim=began, realtime=was_realtime)
 
 
 def _began_simulated(run_dir: Path) -> bool | None:

@@ -182,6 +182,7 @@ def test_a_run_is_resumed_simulated_or_not_as_it_began(tmp_path: Path) -> None:
     assert with_origin(resumed) is resumed  # of an older version, and without a recording
     Recorder(tmp_path / TELEMETRY, [], is_simulation=True).close()
     assert with_origin(resumed).sim  # of an older version
+    assert with_origin(replace(resumed, realtime=True)).realtime  # which does not say how it was
     assert read_run_id(tmp_path) == ""
     keep_origin(tmp_path, is_sim=True, is_realtime=False, is_new=False)
     assert read_run_id(tmp_path) == ""  # its files have none
@@ -197,7 +198,8 @@ def test_a_run_is_resumed_simulated_or_not_as_it_began(tmp_path: Path) -> None:
     assert with_origin(resumed).sim
     assert not with_origin(replace(resumed, resume=False)).sim
     assert not with_origin(resumed).realtime
-    assert with_origin(replace(resumed, realtime=True)).realtime
+    with pytest.raises(ConfigError, match=r"--realtime: the run in .* began without it; leave it out"):
+        with_origin(replace(resumed, realtime=True))
     keep_origin(tmp_path, is_sim=True, is_realtime=True, is_new=True)
     assert with_origin(resumed).realtime  # the wall clock of its operators, not the speed of the machine
 
