@@ -12,7 +12,7 @@ from ccatp.mirror.network_model import Effect, EffectKind
 from ccatp.mirror.network_points import CalibratedSurveys
 
 MICRO = 1e6
-_MANY_CHANGES = 3  # of one channel, from which they are told together
+_MANY_CHANGES = 3  # of one channel, from which one line states them together
 GAUGE = "a common motion of all collimators, which shows in no length"
 
 
@@ -99,13 +99,13 @@ def _changes(found: CalibratedSurveys) -> Iterator[str]:
     """Each finding; many changes of one channel together, which are the parts of one that is not in the model."""
     findings = found.network.findings
     channels = Counter(one.effect.of for one in findings if one.effect.is_of_channel)
-    told = set[int]()
+    stated = set[int]()
     for one in findings:
         of = one.effect.of
         if not one.effect.is_of_channel or channels[of] < _MANY_CHANGES:
             yield finding_text(found, one)
-        elif of not in told:
-            told.add(of)
+        elif of not in stated:
+            stated.add(of)
             sizes = [abs(other.size) for other in findings if other.effect.is_of_channel and other.effect.of == of]
             yield (
                 f"channel {found.channels[of]} changes {len(sizes)} times, by up to {MICRO * max(sizes):.1f} um: it "

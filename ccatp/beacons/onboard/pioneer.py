@@ -189,7 +189,7 @@ class PioneerBase(BeaconDevice):
                 self._doubts = min(self._doubts + 1, 40) if is_off else 0
 
     def _take_counts(self, counts: tuple[int, int], now_s: float) -> None:
-        """The mean speeds since the newest sample; counts that give none are left to the next one: no way is lost."""
+        """The mean speeds since the newest sample; counts without one are kept for the next: no travel is lost."""
         self._counts_s = now_s
         self._line.recover()
         if self._last is None:

@@ -477,7 +477,7 @@ def test_samples_of_wheels_and_motes_count_at_their_own_times(system: str) -> No
             delay_s = hypot(there[0] - mote_x_m, there[1] - mote_y_m) / 344.0
             bursts = [MoteBurst(heard_s, name, "robot", 20.0, [delay_s])]
         navigator.take(BeaconMeasurements(t_s, (wheels,), BeaconFrame(motes=bursts)))
-        if k > 1:  # before, the wheels have not told their speed for as long
+        if k > 1:  # before, wheel samples do not reach back as long
             assert navigator.belief.pose == pytest.approx(pose(t_s), abs=1e-3)  # 1 mm of the 21 mm since the wheels
     assert navigator.score.refused == 0
 

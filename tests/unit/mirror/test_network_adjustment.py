@@ -413,7 +413,7 @@ def drifting(number: int, some: dict[int, float]) -> dict[int, float]:
 
 
 def test_a_channel_that_drifts_is_told_as_one_that_changes_often() -> None:
-    """A drift of one channel is not in the model: its parts are told together, and the panels are right."""
+    """A drift of one channel is not in the model: one line states its parts, and the panels are right."""
     measured = survey(drifting, LIES)
     result, network = align_survey(CFG, M1, measured, PANELS)
     assert network is not None
