@@ -11,7 +11,7 @@ from ccatp.core import FloatArray
 FEWEST = 20  # readings of a beacon from which its noise is estimated
 SPANS = 5.0  # correlation times of the errors that readings must span: in a shorter time such errors look constant
 ASSUMED = 10.0  # number of independent readings for which the configured noise counts
-LEAST = 0.04  # smallest factor on the configured variance
+LEAST = 0.25  # smallest factor on the configured variance
 CLIPPED = 3.0  # standard deviations at which residuals are cut off: outliers are no errors that last
 SURE = 2.0  # standard deviations of a correlation by chance, above which it counts
 MOST_SHARE, LONGEST = 0.95, 0.995  # of the variance that lasts; correlation of successive readings
