@@ -7,6 +7,7 @@ import re
 import tomllib
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from typing import Any, NamedTuple, get_args
 
 from pydantic import BaseModel
@@ -140,7 +141,8 @@ def faults_of(errors: Iterable[Mapping[str, Any]], root: type[BaseModel] = Confi
     A key that is missing because it is misspelt is one problem, that of the unknown key.
     """
     ordered = sorted(errors, key=lambda error: error["type"] != "extra_forbidden")
-    meant = {_meant(tuple(error["loc"]), root) for error in ordered if error["type"] == "extra_forbidden"}
+    unknown = [tuple(error["loc"]) for error in ordered if error["type"] == "extra_forbidden"]
+    meant = {_meant(key, root) for key in unknown} if any(error["type"] == "missing" for error in ordered) else set()
     for error in ordered:
         if error["type"] != "missing" or tuple(error["loc"]) not in meant:
             yield ConfigProblem(tuple(error["loc"]), _what(error, root))
@@ -168,7 +170,7 @@ def _what(error: Mapping[str, Any], root: type[BaseModel]) -> str:
 def _meant(key: Key, root: type[BaseModel]) -> Key | None:
     """The key that an unknown one means: the nearest one beside it, else one of the same name in another section."""
     siblings = _siblings(key, root)
-    everywhere = {path[-1]: path for path in _paths(root)}
+    everywhere = {path[-1]: path for path in _known_paths(root)}
     for known in siblings, everywhere:
         if near := nearest(str(key[-1]), known):
             return known[near]
@@ -178,7 +180,7 @@ def _meant(key: Key, root: type[BaseModel]) -> Key | None:
 def _siblings(key: Key, root: type[BaseModel]) -> dict[str, Key]:
     """The known keys beside a key, by their last part."""
     *section, _ = key
-    beside = [path for path in _paths(root) if len(path) == len(key) and all(map(_fits, path, section))]
+    beside = [path for path in _known_paths(root) if len(path) == len(key) and all(map(_fits, path, section))]
     return {path[-1]: (*section, path[-1]) for path in beside}
 
 
@@ -191,6 +193,11 @@ def _unknown(key: Key, root: type[BaseModel]) -> str:
 
 def _fits(part: str, given: str | int) -> bool:
     return part in ("*", given)
+
+
+@cache
+def _known_paths(root: type[BaseModel]) -> tuple[tuple[str, ...], ...]:
+    return tuple(_paths(root))
 
 
 def _paths(model: type[BaseModel], prefix: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
