@@ -16,7 +16,7 @@ def wrong(cells: list[Cell]) -> list[str]:
 
 
 @ROW
-@pytest.mark.parametrize("motors", MOTORS)
+@pytest.mark.parametrize("motors", ["lag", pytest.param("motors", marks=pytest.mark.slow)])
 def test_a_few_gaps_of_all_encoders(motors: str, measured: Measured) -> None:
     """Some seeds of the campaign."""
     ways, silent = (Way("leg", "rule"), Way("turn", "ttl")), ("", "enc", "imu+enc+edge")

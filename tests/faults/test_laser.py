@@ -282,7 +282,7 @@ async def test_a_reply_without_an_end_takes_no_memory(measured: Measured) -> Non
 
 
 @pytest.mark.fault("E3")
-@pytest.mark.parametrize("name", ["ekf", "kf"])
+@pytest.mark.parametrize("name", ["ekf", pytest.param("kf", marks=pytest.mark.slow)])
 def test_outliers_are_not_fused(name: str, tmp_path: Path, measured: Measured) -> None:
     rng = np.random.default_rng(11)
 
@@ -325,7 +325,14 @@ def test_a_puck_off_the_surface_is_refused(height_m: float, is_taken: bool, tmp_
 
 
 @pytest.mark.fault("E4")
-@pytest.mark.parametrize("way", [(0.03, 0.0, 0.0), (0.0, -0.06, 0.0), (0.1, 0.1, 0.2)])
+@pytest.mark.parametrize(
+    "way",
+    [
+        (0.03, 0.0, 0.0),
+        pytest.param((0.0, -0.06, 0.0), marks=pytest.mark.slow),
+        (0.1, 0.1, 0.2),
+    ],
+)
 def test_a_robot_put_elsewhere_is_accepted_after_three_fixes(
     way: tuple[float, float, float], tmp_path: Path, measured: Measured
 ) -> None:

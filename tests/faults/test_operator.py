@@ -483,7 +483,7 @@ def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(
 
 
 @pytest.mark.fault("O10")
-@pytest.mark.parametrize("budget_s", [45.0, 70.0])
+@pytest.mark.parametrize("budget_s", [pytest.param(45.0, marks=pytest.mark.slow), 70.0])
 def test_points_beyond_the_budget_are_not_measured(budget_s: float, tmp_path: Path, measured: Measured) -> None:
     cfg = one_panel(run__seed=3, run__panels=2, run__budget_s=budget_s, mission__holds_to_budget=True)
     run = MeasuredSurvey(cfg, tmp_path, plan=plan_of("body slip at_s=20.0 for_s=20.0 factor=0.8"))

@@ -239,7 +239,12 @@ def test_a_rehearsal_is_the_run_without_the_sockets(
 
 
 @pytest.mark.parametrize(
-    "fault", ['type = "at_rest"', 'type = "noisy"\nfactor = 3e4', 'type = "offset"\nchannel = 2\noffset_m = 0.2']
+    "fault",
+    [
+        'type = "offset"\nchannel = 2\noffset_m = 0.2',
+        pytest.param('type = "at_rest"', marks=pytest.mark.slow),
+        pytest.param('type = "noisy"\nfactor = 3e4', marks=pytest.mark.slow),
+    ],
 )
 def test_a_fault_of_the_laser_acts_alike_with_and_without_the_sockets(start: Start, tmp_path: Path, fault: str) -> None:
     """Fixes are refused, repeated and given up in the same places, and the mission ends alike."""

@@ -14,15 +14,17 @@ from ccatp.studies.sil_run import rehearse
 from tests.support.scenario import config_of
 
 HARD = {"mirror": "fyst-m2", "seed": 4, "world": "hard"}
+NO_DRIVE = {"mission.calibration_length_m": 0.0}  # the calibration drive takes as long as a panel
 
 
 @pytest.fixture(scope="module")
 def run() -> SurveyRun:
-    return ccatp.simulate(**HARD, panels=1)  # type: ignore[arg-type]
+    return ccatp.simulate(**HARD, panels=1, settings=NO_DRIVE)  # type: ignore[arg-type]
 
 
 def test_it_is_the_survey_of_its_configuration(run: SurveyRun) -> None:
-    result = rehearse(config_of("fyst-m2", run__seed=4, run__world="hard", run__panels=1))
+    keys = {"run__seed": 4, "run__world": "hard", "run__panels": 1, "mission__calibration_length_m": 0.0}
+    result = rehearse(config_of("fyst-m2", **keys))
     track = run.track()
     columns = ("true_x_m", "true_y_m", "true_heading_rad", "x_m", "y_m", "heading_rad")
     assert np.array_equal(np.column_stack([track[name] for name in columns]), result.track[:, 1:])
@@ -55,7 +57,7 @@ def test_times_of_all_tables_agree_where_the_clock_of_the_robot_is_set_back(tmp_
     """By the truth: the robot stands where a fix is taken, and the gyroscope sees its turns."""
     plan = tmp_path / "plan.toml"
     plan.write_text('[[fault]]\nsignal = "clock"\ntype = "jump"\nat_s = 30.0\nby_s = -25.0\n')
-    run = ccatp.simulate(mirror="fyst-m2", seed=4, world="thesis", panels=1, faults=plan)
+    run = ccatp.simulate(mirror="fyst-m2", seed=4, world="thesis", panels=1, faults=plan, settings=NO_DRIVE)
     track, imu, fixes = run.track(), run.samples("imu"), run.fixes
     assert (np.diff(track["t_s"]) > 0.0).all()
     turned_rad = np.interp(imu["t_s"], track["t_s"], np.unwrap(track["true_heading_rad"]))

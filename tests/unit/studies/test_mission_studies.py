@@ -374,7 +374,7 @@ RUNS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
         ("data=Plaza2,XBee scenario 1", "estimator=ekf-slam,fingerprints"), ("--data", str(RECORDINGS)), "recordings",
     ),
     "traits": (("traits=plain", "estimator=ekf-slam"), (), ""),
-    "damage": (("damage=5 % ranges of 0 m",), ("--data", str(RECORDINGS)), ""),
+    "damage": (("damage=5 % ranges of 0 m", "estimator=ekf-slam"), ("--data", str(RECORDINGS)), ""),
     "mote-navigation": ((), ("--set", "mission.laps=1"), "mote_navigation"),
     "radio-signals": (("condition=white 2 dB",), (), "radio_signals"),
     "radio-slam": (("room=3 m", "condition=white", "every=30"), FEW_STEPS, "radio_slam"),
