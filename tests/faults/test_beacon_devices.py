@@ -406,7 +406,7 @@ def test_a_mote_that_is_pulled_is_named_and_works_again(measured: Measured) -> N
     assert not driving.is_held
     mote.plug()
     driving.until(lambda: not driving.robot.faults)
-    mote.pulse(ID, "A", 0.005)
+    mote.pulse(ID, "X", 0.005)
     driving.until(lambda: len(driving.robot._motes) == 1, 0.1)
 
 
@@ -416,7 +416,7 @@ def test_a_mote_that_repeats_its_time_stamp_counts_once(measured: Measured) -> N
     mote = driving.rig.listeners["robot"]
     mote.stamp_ms = 5131680
     for _ in range(4):
-        mote.pulse(ID, "A", 0.005)
+        mote.pulse(ID, "X", 0.005)
         driving.run(0.02)
     measured("B38", len(driving.robot._motes), "pulses")
 
@@ -428,7 +428,7 @@ def test_lines_that_lack_a_byte_give_no_wrong_delay(measured: Measured) -> None:
     wrong = 0
     for k in range(70):
         mote.corrupt = lambda data, k=k: data[:k] + data[k + 1 :]  # type: ignore[misc]
-        mote.pulse(ID, "A", 0.012345)
+        mote.pulse(ID, "X", 0.012345)
         driving.run(0.02)
         wrong += any(abs(burst.delays_s[0] - 0.012345) > 3e-4 for burst in driving.robot._motes)
         driving.robot._motes.clear()

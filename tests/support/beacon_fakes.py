@@ -7,7 +7,7 @@ import errno
 import os
 from collections import deque
 from collections.abc import Callable, Mapping
-from math import pi, tau
+from math import ceil, pi, tau
 
 from ccatp.beacons.sim.radio import SimDriveCommand
 from ccatp.onboard.hardware import HardwareError
@@ -18,7 +18,8 @@ class FakePort:
     """A serial port and the device behind it.
 
     corrupt: changes the bytes of one message on their way to the host. is_mute: takes and sends nothing. open_error:
-    raised by each attempt to open it.
+    raised by each attempt to open it. baud: of a line on which bytes take time. latency_s: of an adapter, which hands
+    on what it has received so often.
     """
 
     def __init__(self, time: FakeTime) -> None:
@@ -26,17 +27,25 @@ class FakePort:
         self.corrupt: Callable[[bytes], bytes] = bytes
         self.is_mute = self.is_unplugged = False
         self.open_error: Exception | None = None
+        self.baud: int | None = None
+        self.latency_s = self._request_s = 0.0
         self.opened = self.closed = 0
         self._sent: deque[tuple[float, bytes]] = deque()
+        self._free_s = 0.0  # the line to the host
         self._arrived = b""
 
     def open(self) -> "FakePort":
         if self.open_error is not None:
             raise self.open_error
         self.opened += 1
-        self._sent.clear()
+        self.forget()
         self._arrived = b""
         return self
+
+    def forget(self) -> None:
+        """Send nothing of what is not sent yet."""
+        self._sent.clear()
+        self._free_s = 0.0
 
     def unplug(self) -> None:
         self.is_unplugged, self.open_error = True, HardwareError("/dev/ttyX: is not there; check the wiring")
@@ -47,8 +56,13 @@ class FakePort:
     def write(self, data: bytes, /) -> int:
         self._check()
         if not self.is_mute:
+            self._request_s = self._line_s(data)
             self.take(data)
+            self._request_s = 0.0
         return len(data)
+
+    def _line_s(self, data: bytes) -> float:
+        return 0.0 if self.baud is None else 10.0 * len(data) / self.baud
 
     def read(self, size: int, /) -> bytes:
         self._check()
@@ -68,9 +82,10 @@ class FakePort:
         """Bytes of one message, which arrive after a delay, in order."""
         data = self.corrupt(data)
         if data and not self.is_mute:
-            arrival_s = self._time.now_s + after_s
-            if self._sent:
-                arrival_s = max(arrival_s, self._sent[-1][0])
+            begin_s = max(self._time.now_s + self._request_s + after_s, self._free_s)
+            arrival_s = self._free_s = begin_s + self._line_s(data)
+            if self.latency_s:
+                arrival_s = ceil(arrival_s / self.latency_s) * self.latency_s
             self._sent.append((arrival_s, data))
 
     def take(self, data: bytes) -> None:
@@ -93,6 +108,7 @@ class FakeXBee(FakePort):
     """The coordinator with Zigbee or 802.15.4 firmware; ``level`` gives the strength of the packet of a radio, or None.
 
     extra: frames that arrive behind the next answer of a radio, each with the strength of its packet, if it is one.
+    has_level, has_parent: of an answer to the node discovery with 802.15.4, which differs among the firmwares.
     """
 
     OWN = 0x0013A20041AE0001
@@ -100,18 +116,20 @@ class FakeXBee(FakePort):
     def __init__(self, time: FakeTime, names: list[str], level: Callable[[str], float | None]) -> None:
         super().__init__(time)
         self.api_mode = 1
-        self.is_zigbee = True
+        self.is_zigbee = self.has_level = True
+        self.has_parent = False
         self.nodes = {0x0013A20040520000 + k: name for k, name in enumerate(names, 1)}
         self.parents: dict[str, int] = {}  # of end devices
         self.level = level
         self.extra: list[tuple[bytes, int | None]] = []
         self.strength = 0
+        self.search = 60  # NT, 0.1 s
         self._host = b""
 
     def reset(self) -> None:
         """As by its reset line; it reports it, and forgets what it was asked."""
         self._host, self.strength = b"", 0
-        self._sent.clear()
+        self.forget()
         self.frame(b"\x8a\x00", 0.1)
         self.frame(b"\x8a\x06", 0.2)
 
@@ -170,7 +188,7 @@ class FakeXBee(FakePort):
             serial = self.OWN.to_bytes(8, "big")
             values = {
                 b"AP": bytes([self.api_mode]), b"SH": serial[:4], b"SL": serial[4:], b"VR": b"\x40\x60",
-                b"NI": b"CRT", b"DB": bytes([self.strength]),
+                b"NI": b"CRT", b"NT": bytes([self.search]), b"DB": bytes([self.strength]),
             }  # fmt: skip
             known = command in values
             self.frame(b"\x88" + frame_id + command + bytes([0 if known else 2]) + values.get(command, b""), OWN_S)
@@ -190,7 +208,9 @@ class FakeXBee(FakePort):
     def _node(self, address: int, name: str) -> bytes:
         start = b"\x12\x34" + address.to_bytes(8, "big")
         if not self.is_zigbee:
-            return start + b"\x2a" + name.encode() + b"\x00"
+            level = b"\x2a" if self.has_level else b""
+            rest = b"\xff\xfe\x02\x00\xc1\x05\x10\x1e" if self.has_parent else b""
+            return start + level + name.encode() + b"\x00" + rest
         is_end = name in self.parents
         parent = self.parents.get(name, 0xFFFE).to_bytes(2, "big")
         return start + name.encode() + b"\x00" + parent + bytes([2 if is_end else 1]) + b"\x00\xc1\x05\x10\x1e"

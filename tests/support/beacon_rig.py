@@ -46,6 +46,7 @@ def onboard_config(cfg: RadioConfig, **overrides: Any) -> BeaconOnboardConfig:
         "robot.loop_hz": 100.0,
         "devices.base.sonars": [7, 6, 5, 4, 3, 2, 1, 0, *REAR_SONARS][: len(angles)],
         "devices.base.sonars_rad": angles,
+        "devices.base.baud": 115200 if is_cricket else 9600,
         "devices.radio.names": names,
         "devices.radio.is_used": not is_cricket,
         "devices.dish.is_used": not is_cricket,
@@ -92,10 +93,17 @@ class BeaconBench:
         if self._listener is not None:
             for burst in self._listener.receive(self.world.time_s, self.world.pose):
                 for delay_s in burst.delays_s if burst.listener in self.listeners else ():
-                    self.listeners[burst.listener].pulse("1:aa:61:61:b:0:0:1", burst.sender, delay_s)
+                    self.listeners[burst.listener].pulse(self._id_of(burst.sender), burst.sender, delay_s)
         if not (velocity_m_s or turn_rad_s):
             return 0.0, 0.0  # encoders of a robot that stands do not count
         return frame.wheels.speed_m_s, frame.wheels.turn_rate_rad_s
+
+    def _id_of(self, mote: str) -> str:
+        """Unique id of a mote."""
+        if mote in self.listeners:
+            return self.listeners[mote].unique_id
+        assert self.motes is not None
+        return f"1:{self.motes.names.index(mote):x}:61:61:b:0:0:1"
 
     def _sonars_m(self) -> list[float]:
         base = self.onboard.devices.base

@@ -17,10 +17,12 @@ from ccatp.config.robot_limits import VEHICLE_FRAME_HZ, WheelBase, WheelRadius
 
 ListenerName = Annotated[Name, Field(max_length=16)]  # many of them share a line of the link
 Baud = Annotated[int, Field(ge=1200, le=921_600)]
+BaseBaud = Annotated[int, Field(ge=9600, le=115_200)]  # with 4800 baud commands would queue up before the base
 COLDEST_C, HOTTEST_C = -60.0, 80.0  # that a thermometer of a robot may show
 Celsius = Annotated[float, Field(ge=COLDEST_C, le=HOTTEST_C)]
 SCAN_LEVELS = 800  # of a scan, which must not exceed the limit of a line of the link
 _STEPS_OF_WATCHDOG = 5  # of the control loop, in the time of the base's watchdog: one may be late
+_CYCLE_BITS = 600  # of the packets that the base sends in a cycle: counts, speeds and six sonars
 
 
 class BeaconLinkConfig(OnboardLinkConfig):
@@ -83,7 +85,7 @@ class BaseDeviceConfig(Model):
 
     is_used: bool
     device: Text
-    baud: Baud
+    baud: BaseBaud
     timeout_s: Positive
     counts_per_mm: Positive
     acceleration_m_s2: Positive
@@ -153,6 +155,9 @@ def check_beacon_onboard_config(cfg: BeaconOnboardConfig) -> Iterator[ConfigProb
          "devices.dish.positions"),
         (not any(one.is_used for one in (base, devices.radio, devices.listeners)), "devices.base.is_used",
          "is false, as of all other devices", "devices.radio.is_used", "devices.listeners.is_used"),
+        (base.is_used and devices.listeners.is_used and link.sample_latency_s * base.baud < _CYCLE_BITS,
+         "devices.base.baud", f"lets packets take {_CYCLE_BITS / base.baud:.2f} s: then wheels are known later than "
+         "motes, by more than link.sample_latency_s; set HostBaud of the base to 115200", "devices.listeners.is_used"),
         (devices.listeners.is_used and not devices.listeners.devices, "devices.listeners.devices",
          "names no listener", "devices.listeners.is_used"),
     ):  # fmt: skip

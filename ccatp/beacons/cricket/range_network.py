@@ -220,6 +220,17 @@ class PairMeans:
             self.table_m[i, j], self.sigma_table_m[i, j] = self.ranges_m, self.sigmas_m
 
 
+def _kelvin(temperature_c: float) -> float:
+    if not COLDEST_C <= temperature_c <= HOTTEST_C:
+        raise TdoaError(f"temperature of {temperature_c:g} C is outside {COLDEST_C:g} to {HOTTEST_C:g} C")
+    return temperature_c - ABSOLUTE_ZERO_C
+
+
+def delay_at(at_c: float, delay_s: float, temperature_c: float) -> float:
+    """The delay of the same way in air of another temperature ``at_c``. Raises TdoaError: impossible temperature."""
+    return delay_s * sqrt(_kelvin(temperature_c) / _kelvin(at_c))
+
+
 _MEDIAN_COST = np.sqrt(np.pi / 2.0)  # standard deviation of the median over that of the mean, for normal noise
 
 
@@ -237,9 +248,7 @@ def pair_range(
     delay_s = float(np.median(delays_s) if ranging.combine == "median" else np.mean(delays_s))
     if not 0.0 <= delay_s < float("inf"):
         raise TdoaError(f"delay of {delay_s:g} s: the pulse cannot arrive before the message")
-    if not COLDEST_C <= temperature_c <= HOTTEST_C:
-        raise TdoaError(f"temperature of {temperature_c:g} C is outside {COLDEST_C:g} to {HOTTEST_C:g} C")
-    kelvin = temperature_c - ABSOLUTE_ZERO_C
+    kelvin = _kelvin(temperature_c)
     range_m = air.sound_speed_m_s * sqrt(kelvin / (air.temperature_c - ABSOLUTE_ZERO_C)) * delay_s
     sigma_m = sqrt(ranging.sigma_m**2 / count + (range_m * (ranging.thermometer_sigma_c / (2.0 * kelvin))) ** 2)
     if ranging.combine == "median" and count > 2:

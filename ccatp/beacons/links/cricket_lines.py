@@ -18,14 +18,21 @@ _ID = re.compile(r"[0-9a-f]{1,2}(?::[0-9a-f]{1,2}){7}", re.IGNORECASE)
 _REPORT = re.compile(r"(Mode|Unique id|Space id|Local temperature value \(Celsius\)): *([^ ]+)")
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 _OLD = {"space": "SP", "id": "ID", "duration": "DR", "time": "TM"}
+_FEW, _RARE = 3, 0.01  # times, and share, that damage gives a pair of unique id and space id less often
 
 
 class Pulse(NamedTuple):
-    """A received pulse; ``sender``: space id of the mote, or its unique id without one. ``stamp_ms``: None without."""
+    """A received pulse.
 
-    sender: str
+    ``space``: space id of the sender, empty without one. ``stamp_ms``: None without. ``temperature_c``: of the newest
+    report of the listener before, None without.
+    """
+
+    unique_id: str
+    space: str
     delay_s: float
     stamp_ms: int | None
+    temperature_c: float | None = None
 
 
 class MoteReport(NamedTuple):
@@ -63,12 +70,54 @@ def parse_pulse(text: str) -> Pulse | None:
         if not any(low_m < (steps + 1.5) * unit_m and (steps - 1.5) * unit_m < high_m for unit_m in _UNITS_M):
             return None
     stamp = fields.get("TS", "")
-    name = fields.get("SP") or (fields["ID"] if is_old else full_id(fields["ID"]))
-    return Pulse(name, delay_s, int(stamp) if stamp.isdigit() else None)
+    unique_id = fields["ID"] if is_old else full_id(fields["ID"])
+    return Pulse(unique_id, fields.get("SP", ""), delay_s, int(stamp) if stamp.isdigit() else None)
+
+
+class Senders:
+    """The names of motes: the name as a listener, else the space id, else the unique id.
+
+    A damaged line may have a unique id or a space id that looks right; then it does not fit those of most lines.
+
+    Attributes:
+        listeners: names of the motes that listen, by unique id.
+        twins: space ids that several motes have.
+    """
+
+    def __init__(self) -> None:
+        self._spaces: dict[str, Counter[str]] = {}  # received with each unique id
+        self._ids: dict[str, Counter[str]] = {}  # received with each space id
+        self.listeners: dict[str, str] = {}
+        self.twins: set[str] = set()
+
+    def count(self, pulse: Pulse) -> None:
+        """Take which ids belong together."""
+        if pulse.space:
+            self._spaces.setdefault(pulse.unique_id, Counter())[pulse.space] += 1
+            self._ids.setdefault(pulse.space, Counter())[pulse.unique_id] += 1
+
+    def name_of(self, pulse: Pulse) -> str | None:
+        """The name of the sender of a pulse that was counted; None: it is damaged, or several motes have this name."""
+        unique_id, space = pulse.unique_id, pulse.space
+        if (name := self.listeners.get(unique_id)) is not None:
+            return name
+        spaces = self._spaces.get(unique_id, Counter())
+        space = space or max(spaces, key=spaces.__getitem__, default="")
+        if not space:
+            return unique_id
+        ids = self._ids[space]
+        count = ids[unique_id]
+        others = [number for other, number in ids.items() if other != unique_id]
+        most = max(others + [number for other, number in spaces.items() if other != space], default=0)
+        if count <= most and count < max(_FEW, _RARE * most):
+            return None
+        if max(others, default=0) >= max(_FEW, _RARE * count):
+            self.twins.add(space)
+        return None if space in self.twins else space
 
 
 class LineReader:
-    """Collects bytes to lines, and their pulses; a pulse with the sender and time stamp of the one before is dropped.
+    """Collects bytes to lines, and their pulses; a pulse with the mote and time stamp of the one before is dropped.
 
     Attributes:
         report: what the mote said of itself.
@@ -114,12 +163,12 @@ class LineReader:
             self.counts["garbled" if "DR=" in part or "TS=" not in part else "silent"] += 1
             return []
         if pulse.stamp_ms is not None:
-            if self._stamps.get(pulse.sender) == pulse.stamp_ms:
+            if self._stamps.get(pulse.unique_id) == pulse.stamp_ms:
                 self.counts["duplicates"] += 1
                 return []
-            self._stamps[pulse.sender] = pulse.stamp_ms
+            self._stamps[pulse.unique_id] = pulse.stamp_ms
         self.counts["pulses"] += 1
-        return [pulse]
+        return [pulse._replace(temperature_c=self.report.temperature_c)]
 
     def _report(self, part: str) -> None:
         match = _REPORT.search(part)

@@ -65,11 +65,13 @@ Message = AtResponse | RemoteResponse | ModemStatus | RouteRecord | OtherFrame
 
 
 class Node(NamedTuple):
-    """A module that answered the node discovery; ``is_relayed``: its packets come by way of another module."""
+    """A module that answered the node discovery.
+
+    ``is_relayed``: its packets come by way of another module; None for one that the answer says nothing of.
+    """
 
     address: int
-    name: str
-    is_relayed: bool
+    is_relayed: bool | None
 
 
 class FrameReader(FrameFinder):
@@ -161,20 +163,20 @@ def parse_frame(data: bytes) -> Message:
 def parse_node(data: bytes) -> Node | None:
     """One answer to the node discovery ``ND``; None for its end and for what is no such answer.
 
-    Zigbee: network address (2), serial number (8), name, zero, parent (2), type, status, profile (2), maker (2), and
-    what ``NO`` adds. 802.15.4: network address (2), serial number (8), level, name, zero.
+    Network address (2), serial number (8), with 802.15.4 a level, name, zero. With Zigbee, and with some firmware of
+    802.15.4, also parent (2), type, status, profile (2), maker (2), and what ``NO`` adds. The name is not read from
+    here, because nothing shows whether a level stands before it. A router may be relayed as well; a route record says
+    so.
     """
-    if len(data) < 12:
-        return None
-    address = int.from_bytes(data[2:10])
-    name, zero, rest = data[10:].partition(b"\0")
+    _, zero, rest = data[10:].partition(b"\0")
     if not zero:
         return None
-    if not rest:  # 802.15.4, where all modules receive each other directly
-        name, is_relayed = name[1:], False
-    elif len(rest) >= 8:
-        is_relayed = rest[2] == _END_DEVICE and int.from_bytes(rest[:2]) not in _COORDINATORS
-    else:
-        return None
-    text = name.decode("ascii", "replace").strip()
-    return Node(address, text or f"{address:016X}", is_relayed)
+    is_relayed = None
+    if len(rest) >= 8 and rest[2] == _END_DEVICE:
+        is_relayed = int.from_bytes(rest[:2]) not in _COORDINATORS
+    return Node(int.from_bytes(data[2:10]), is_relayed)
+
+
+def name_of(address: int, data: bytes) -> str:
+    """The name of a module from its answer to ``NI``; its serial number without one."""
+    return data.decode("latin-1").strip("\0 ") or f"{address:016X}"

@@ -11,6 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 from ccatp.beacons.config.onboard_models import BeaconOnboardConfig
+from ccatp.beacons.links.cricket_lines import Senders
 from ccatp.beacons.links.messages import MoteBurst
 from ccatp.beacons.onboard.dish import Dish
 from ccatp.beacons.onboard.listener import CricketListener
@@ -88,8 +89,9 @@ class BeaconHardware:
             if dish is not None:
                 self._devices["dish"] = self.scanner
         names = devices.listeners.devices if devices.listeners.is_used else ()
+        senders = Senders()
         self.listeners = [
-            CricketListener(name, devices.listeners, access.open_port, clock, self._wait) for name in names
+            CricketListener(name, devices.listeners, senders, access.open_port, clock, self._wait) for name in names
         ]
         self._devices |= {one.title: one for one in self.listeners}
         self._opened = ExitStack()

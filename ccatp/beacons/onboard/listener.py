@@ -3,7 +3,7 @@
 from math import inf
 
 from ccatp.beacons.config.onboard_models import COLDEST_C, HOTTEST_C, ListenersConfig
-from ccatp.beacons.links.cricket_lines import LineReader
+from ccatp.beacons.links.cricket_lines import LineReader, Senders
 from ccatp.beacons.links.messages import MoteBurst
 from ccatp.beacons.onboard.recognition import BeaconDevice
 from ccatp.onboard.devices.serial_device import Clock, Sleep
@@ -18,7 +18,7 @@ _DIGITS = 6
 
 
 class CricketListener(BeaconDevice):
-    """The mote.
+    """The mote. ``senders``: those of all listeners.
 
     Attributes:
         name: of the listener, in readings.
@@ -27,9 +27,11 @@ class CricketListener(BeaconDevice):
 
     key = "devices.listeners"
 
-    def __init__(self, name: str, config: ListenersConfig, open_port: OpenPort, clock: Clock, sleep: Sleep) -> None:
+    def __init__(
+        self, name: str, config: ListenersConfig, senders: Senders, open_port: OpenPort, clock: Clock, sleep: Sleep
+    ) -> None:
         super().__init__((config.devices[name], config.baud), open_port, clock, sleep)
-        self._config = config
+        self._config, self._senders = config, senders
         self.name, self.title = name, f"listener {name}"
         self.reader = LineReader()
         self._bursts: list[MoteBurst] = []
@@ -54,6 +56,8 @@ class CricketListener(BeaconDevice):
                 return "its lines are damaged or repeated; check its output format (3) and its cable"
             if not self._is_temperature_possible:
                 return f"its thermometer shows {self.reader.report.temperature_c:g} degrees; switch it off (P TP 0)"
+            if twins := sorted(self._senders.twins):
+                return f"several motes have the space id {', '.join(twins)}; give each another one (P SP)"
             return ""
         return self.why()
 
@@ -85,6 +89,7 @@ class CricketListener(BeaconDevice):
             raise HardwareError(f"the mote is in {report.mode.lower()} mode; set it to listener mode (MD)")
         if report.unique_id is not None:
             self._identity = f"Cricket {report.unique_id} {report.space or ''}".strip()
+            self._senders.listeners[report.unique_id] = self.name
         if pulses or reader.counts["silent"] + reader.counts["reports"] > before:
             self._heard_s = now_s
             self._useless_before = self._useless if pulses else self._useless_before
@@ -95,7 +100,10 @@ class CricketListener(BeaconDevice):
         if temperature_c is None or not self._is_temperature_possible:
             temperature_c = self._config.temperature_c
         t_s = round(now_s, _DIGITS)
-        self._bursts += [MoteBurst(t_s, one.sender, self.name, temperature_c, [one.delay_s]) for one in pulses]
+        for pulse in pulses:
+            self._senders.count(pulse)
+            if (sender := self._senders.name_of(pulse)) is not None:
+                self._bursts.append(MoteBurst(t_s, sender, self.name, temperature_c, [pulse.delay_s]))
         if now_s >= min(self._ask_s, self._report_s):
             self._ask(now_s)
 

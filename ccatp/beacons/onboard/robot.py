@@ -27,6 +27,7 @@ _ON_LINK = (*NEEDED, "battery_low")
 _CORNER = (0.0, 0.0)  # reported place of the edge sensors, which it does not have
 # Pulses in a line: with the longest names three quarters of the line's limit, and beside a scan one quarter.
 _LINE_PULSES, _LINE_PULSES_OF_SCANS = 100, 35
+_LATE_STEPS = 5  # of the control loop, after which nobody knows when a pulse came
 _NOTHING = ScanResult(None, [])
 
 
@@ -92,7 +93,10 @@ class BeaconOnboardRobot(ControlledRobot):
         self.faults = dict(readings.faults)
         self._soc = readings.soc
         self._enc += readings.wheels
-        self._motes += readings.motes
+        if dt_s * self.loop_hz <= _LATE_STEPS:
+            self._motes += readings.motes
+        else:
+            self.dropped_samples += len(readings.motes)
         self._distances_m = readings.distances_m or []
         right, left = self.rules.set_points(now_s)
         is_late = dt_s > self._cfg.devices.base.most_watchdog_s

@@ -218,9 +218,9 @@ class Scanner:
         self.silence = f"no level of {', '.join(silent)}: {why or 'too many radios for a frame'}" if silent else ""
 
     def _finish(self, now_s: float) -> None:
-        """Radios that did not answer once are left out."""
+        """Radios that did not answer once, or turned out not to be measurable meanwhile, are left out."""
         self.counts["scans"] += 1
-        received = {name: levels for name, levels in self._levels.items() if any(z is not None for z in levels)}
+        received = {name: self._levels[name] for name in self._coordinator.wanted if any(self._levels.get(name, ()))}
         self._note_silence()
         t_s = round(now_s, _DIGITS)
         if self._dish is None:

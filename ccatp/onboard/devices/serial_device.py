@@ -34,7 +34,7 @@ class SerialDevice(ABC):
         device, baud = place
         self._line = SerialLine(device, baud, open_port, self.key)
         self._clock, self._sleep = clock, sleep
-        self._transmission_s = _SENT_BYTES * _BITS / baud
+        self._byte_s = _BITS / baud
         self._identity = ""
 
     @property
@@ -112,5 +112,5 @@ class SerialDevice(ABC):
         """Stop the device and release the port."""
         if self._line.is_open:
             self._end()
-            self._sleep(self._transmission_s)  # to release the port discards what is not sent yet
+            self._sleep(_SENT_BYTES * self._byte_s)  # to release the port discards what is not sent yet
             self._line.release()

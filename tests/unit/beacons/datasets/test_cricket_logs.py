@@ -4,7 +4,9 @@ import os
 import pty
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +22,14 @@ PLACES = {"A": (0.0, 0.0), "B": (2.0, 0.1), "C": (0.3, 1.8), "D": (2.2, 2.4), "E
 MAPPED = {name: {"place_m": list(place), "facing": [1.0, 0.0]} for name, place in PLACES.items()}
 
 
-def line(sender: str, delay_s: float, stamp: int, space: bool = True) -> str:
+def unique_id(mote: str) -> str:
+    return f"1:{ord(mote):x}:61:61:b:0:0:42"
+
+
+def line(sender: str, delay_s: float, stamp: int, space: bool = True, number: str = "") -> str:
     flight_us = round(1e6 * delay_s)
     name = sender if space else ""
-    where = f"ID=1:{ord(sender):x}:61:61:b:0:0:42,SP={name}"
+    where = f"ID={number or unique_id(sender)},SP={name}"
     return f"VR=2.0,{where},DB={round(34400 * delay_s)},DR={flight_us},TM={flight_us + 358},TS={stamp}"
 
 
@@ -84,12 +90,68 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
     assert "--cricket and --ranges" in refused(capsys, "radio", "map", "--cricket", log, "--ranges", log)
 
 
+def mapped(capsys: pytest.CaptureFixture[str], tmp_path: Path, *sources: object) -> dict[str, Any]:
+    """The map of some logs, compared with the true places."""
+    truth = tmp_path / "truth.csv"
+    truth.write_text("name,x_m,y_m\n" + "\n".join(f"{name},{x},{y}" for name, (x, y) in PLACES.items()) + "\n")
+    arguments = [text for source in sources for text in ("--cricket", source)]
+    found: dict[str, Any] = answered(capsys, "radio", "map", *arguments, "--truth", truth)
+    return found
+
+
+def each_log(logs: list[Path], change: Callable[[str], str]) -> None:
+    for log in logs:
+        log.write_bytes(change(log.read_text()).encode())
+
+
+def test_how_a_log_was_written_changes_no_map(
+    logs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = mapped(capsys, tmp_path, *logs)
+    each_log(logs, lambda text: "\ufeff\r\n" + text.replace("\n", "\r\n\r\n").rstrip())
+    assert mapped(capsys, tmp_path, *logs) == plain
+    # A clock that jumps back, and lines without the space id, or with one that lacks a letter.
+    each_log(logs, lambda text: text.replace("TS=28000", "TS=3").replace("SP=A,DB=6", "SP=,DB=6"))
+    assert mapped(capsys, tmp_path, *logs) == plain
+    # Listeners that the user calls by other names are the motes that the others hear under their own.
+    each_log(logs, lambda text: text)
+    named = [f"{name}={log}" for name, log in zip("VWXYZ", logs, strict=True)]
+    reported = zip(logs, MAPPED, strict=True)
+    for log, mote in reported:
+        log.write_text(f"Unique id: {unique_id(mote)}\n" + log.read_text())
+    arguments = [text for source in named for text in ("--cricket", source)]
+    assert answered(capsys, "radio", "map", *arguments)["motes"] == 5
+
+
+def test_each_pulse_has_the_temperature_of_its_time(
+    logs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = mapped(capsys, tmp_path, *logs)
+    # In the evening it is cold; nothing is received any more.
+    each_log(logs, lambda text: text + "Local temperature value (Celsius): -10\n")
+    assert mapped(capsys, tmp_path, *logs)["rms_m"] == plain["rms_m"]
+
+
+def test_motes_with_one_name_are_refused_and_many_damaged_lines_are_reported(
+    logs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = logs[1]
+    whole = log.read_text()
+    log.write_text(whole + "\n".join(line("A", 0.011, k, number="1:99:61:61:b:0:0:42") for k in range(20)))
+    said = refused(capsys, "radio", "map", *(text for one in logs for text in ("--cricket", one)))
+    assert "A: is the space id of several motes; give each another one (P SP)" in said
+    log.write_text(whole + "\n".join(line("A", 0.011, k)[:60] for k in range(40)))
+    warning, *more = mapped(capsys, tmp_path, *logs)["warnings"]
+    assert not more
+    assert warning.startswith("B: 48 samples are damaged or repeat a time stamp")
+
+
 def test_a_mote_without_a_name_is_known_by_its_id_and_a_listener_by_its_file(tmp_path: Path) -> None:
     log = tmp_path / "porch.txt"
     log.write_text(line("A", 0.005, 1, space=False))
     found = listen(str(log), 1.0)
     assert found.name == "porch"
-    assert [pulse.sender for pulse in found.pulses] == ["01:41:61:61:0b:00:00:42"]
+    assert [pulse.unique_id for pulse in found.pulses] == ["01:41:61:61:0b:00:00:42"]
     assert listen(f"hall={log}", 1.0).name == "hall"
 
 

@@ -2,19 +2,21 @@
 
 import pytest
 
-from ccatp.beacons.links.cricket_lines import LineReader, MoteReport, Pulse, full_id, parse_pulse
+from ccatp.beacons.links.cricket_lines import LineReader, MoteReport, Pulse, Senders, full_id, parse_pulse
 
-SHIP, DOCK = "ID=01:25:61:61:0b:00:00:42,SP=ship", "ID=01:4c:61:61:0b:00:00:1f,SP=dock"
+SHIP_ID, DOCK_ID = "01:25:61:61:0b:00:00:42", "01:4c:61:61:0b:00:00:1f"
+SHIP, DOCK = f"ID={SHIP_ID},SP=ship", f"ID={DOCK_ID},SP=dock"
 # From the Cricket v2 manual (output formats 1 to 3), and from a public log of two motes (pharoslabut, FakeSerialM).
 PUBLISHED = {
     "manual, format 3": ("VR=2.0,ID=1:5e:3c:3c:a:0:0:ba,SP=MIT-0,DB=14,DR=423,TM=1045,TS=207040",
-                         Pulse("MIT-0", 423 / 1e6, 207040)),
-    "manual, format 1": ("$Cricket2,ver=3.0,id=45,dist=17,duration=1435,time=1195", Pulse("45", 1435 / 1e6, None)),
-    "manual, format 2": ("$Cricket2,ver=3.0,space=MIT-0,id=45,dist=11,duration=1435", Pulse("MIT-0", 1435 / 1e6, None)),
-    "log": (f"VR=2.0,{SHIP},DB=55,DR=1676,TM=2034,TS=22528", Pulse("ship", 1676 / 1e6, 22528)),
-    "log, spaces": (f"VR=2.0,{DOCK},DB=67,DR=2017,TM=2519,TS=5139296 ", Pulse("dock", 2017 / 1e6, 5139296)),
-    "log, no stamp": (f"VR=2.0,{DOCK},DB=88,DR=2651,TM=2865,           ", Pulse("dock", 2651 / 1e6, None)),
-    "log, cut in the time": (f"VR=2.0,{SHIP},DB=110,DR=3306,TM=371", Pulse("ship", 3306 / 1e6, None)),
+                         Pulse("01:5e:3c:3c:0a:00:00:ba", "MIT-0", 423 / 1e6, 207040)),
+    "manual, format 1": ("$Cricket2,ver=3.0,id=45,dist=17,duration=1435,time=1195", Pulse("45", "", 1435 / 1e6, None)),
+    "manual, format 2": ("$Cricket2,ver=3.0,space=MIT-0,id=45,dist=11,duration=1435",
+                         Pulse("45", "MIT-0", 1435 / 1e6, None)),
+    "log": (f"VR=2.0,{SHIP},DB=55,DR=1676,TM=2034,TS=22528", Pulse(SHIP_ID, "ship", 1676 / 1e6, 22528)),
+    "log, spaces": (f"VR=2.0,{DOCK},DB=67,DR=2017,TM=2519,TS=5139296 ", Pulse(DOCK_ID, "dock", 2017 / 1e6, 5139296)),
+    "log, no stamp": (f"VR=2.0,{DOCK},DB=88,DR=2651,TM=2865,           ", Pulse(DOCK_ID, "dock", 2651 / 1e6, None)),
+    "log, cut in the time": (f"VR=2.0,{SHIP},DB=110,DR=3306,TM=371", Pulse(SHIP_ID, "ship", 3306 / 1e6, None)),
     "log, no pulse": (f"VR=2.0,{DOCK},TS=5132096", None),
     "log, cut in the space": ("VR=2.0,ID=01:9f:61:61:0b:00:00:04,SP=mobilab0", None),
     "log, cut in a name": ("VR=2.0,ID=01:a6:61:61:0b:00:00:77,S", None),
@@ -55,7 +57,7 @@ def test_a_number_that_is_none_is_garbled() -> None:
 
 def test_inches_and_a_mote_without_a_name() -> None:
     assert parse_pulse("VR=2.0,ID=1:5e:3c:3c:a:0:0:ba,SP=,DB=22,DR=1676,TM=2034,TS=5") == Pulse(
-        "01:5e:3c:3c:0a:00:00:ba", 1676 / 1e6, 5
+        "01:5e:3c:3c:0a:00:00:ba", "", 1676 / 1e6, 5
     )
     assert full_id("1:5E:3c:3c:a:0:0:ba") == "01:5e:3c:3c:0a:00:00:ba"
 
@@ -65,10 +67,10 @@ def test_two_samples_on_one_line_a_repeated_stamp_and_the_end_of_a_file() -> Non
     first, second = f"VR=2.0,{SHIP},DB=69,DR=2079,TM=2581,TS=5131680", f"VR=2.0,{DOCK},TS=5132096"
     again = f"VR=2.0,{SHIP},DB=69,DR=2079,TM=2581,TS=5131680"
     found = reader.feed(f"{first}{second}\n{again}\n{SHIP}\n".encode())
-    assert found == [Pulse("ship", 2079 / 1e6, 5131680)]
+    assert found == [Pulse(SHIP_ID, "ship", 2079 / 1e6, 5131680)]
     assert dict(reader.counts) == {"pulses": 1, "silent": 1, "garbled": 0, "duplicates": 1, "reports": 0, "other": 1}
     assert not reader.feed(f"VR=2.0,{DOCK},DB=45,DR=1350,TM=1612,TS=5133472".encode())
-    assert reader.finish() == [Pulse("dock", 1350 / 1e6, 5133472)]
+    assert reader.finish() == [Pulse(DOCK_ID, "dock", 1350 / 1e6, 5133472)]
 
 
 def test_the_report_of_a_mote() -> None:
@@ -87,3 +89,35 @@ def test_endless_lines_are_bounded() -> None:
         reader.feed(b"x" * 1000)
     assert reader.counts["garbled"] == 100
     assert reader.feed(b"\nVR=2.0,ID=1:5e:3c:3c:a:0:0:ba,SP=MIT-0,DB=14,DR=423,TM=1045,TS=207040\n")
+
+
+def named(senders: Senders, unique_id: str, space: str, times: int = 1) -> list[str | None]:
+    """The names of a mote, line by line."""
+    found = []
+    for _ in range(times):
+        pulse = Pulse(unique_id, space, 0.002, None)
+        senders.count(pulse)
+        found.append(senders.name_of(pulse))
+    return found
+
+
+def test_the_name_of_a_mote_is_that_of_most_of_its_lines() -> None:
+    senders = Senders()
+    assert named(senders, SHIP_ID, "ship", 40) == ["ship"] * 40
+    assert named(senders, SHIP_ID, "") == ["ship"]  # a line without the field is of the same mote
+    assert named(senders, SHIP_ID, "shi", 2) == [None] * 2  # a letter is missing
+    assert named(senders, "01:25:61:61:0b:00:00:43", "ship") == [None]
+    assert named(senders, DOCK_ID, "dock", 3) == ["dock"] * 3
+    assert named(senders, "01:a6:61:61:0b:00:00:77", "") == ["01:a6:61:61:0b:00:00:77"]
+    assert not senders.twins
+    assert named(senders, SHIP_ID, "boat", 5)[2:] == ["boat"] * 3  # it was given another name
+    senders.listeners[DOCK_ID] = "N1"
+    assert named(senders, DOCK_ID, "dock") == ["N1"]
+
+
+def test_a_name_that_two_motes_have_is_of_neither() -> None:
+    senders = Senders()
+    named(senders, SHIP_ID, "ship", 5)
+    assert named(senders, DOCK_ID, "ship", 20) == [None] * 20
+    assert senders.twins == {"ship"}
+    assert named(senders, SHIP_ID, "ship") == [None]

@@ -15,6 +15,7 @@ from ccatp.beacons.links.xbee_frames import (
     format_at,
     format_frame,
     format_remote_at,
+    name_of,
     parse_frame,
     parse_node,
 )
@@ -139,18 +140,30 @@ ZIGBEE = bytes.fromhex("1234 0013A20040522BAA") + b"beacon1\x00"
     [
         (
             bytes.fromhex("1785 0013A20040B45023 2000 FFFE 01 00 C105 101E"),  # as published, see above
-            Node(0x0013A20040B45023, "0013A20040B45023", False),
+            Node(0x0013A20040B45023, None),
         ),
-        (ZIGBEE + bytes.fromhex("FFFE 01 00 C105 101E"), Node(BEACON, "beacon1", False)),
-        (ZIGBEE + bytes.fromhex("0000 02 00 C105 101E"), Node(BEACON, "beacon1", False)),  # child of the coordinator
-        (ZIGBEE + bytes.fromhex("4F21 02 00 C105 101E"), Node(BEACON, "beacon1", True)),  # child of a router
-        (ZIGBEE + bytes.fromhex("FFFE 01 00 C105 101E 00030000 2A"), Node(BEACON, "beacon1", False)),  # with NO
-        (bytes.fromhex("1234 0013A20040522BAA 2A") + b"beacon1\x00", Node(BEACON, "beacon1", False)),  # 802.15.4
-        (bytes.fromhex("1234 0013A20040522BAA 2A") + b" \x00", Node(BEACON, "0013A20040522BAA", False)),
+        (ZIGBEE + bytes.fromhex("FFFE 01 00 C105 101E"), Node(BEACON, None)),  # a router, which may be relayed
+        (ZIGBEE + bytes.fromhex("0000 02 00 C105 101E"), Node(BEACON, False)),  # child of the coordinator
+        (ZIGBEE + bytes.fromhex("4F21 02 00 C105 101E"), Node(BEACON, True)),  # child of a router
+        (ZIGBEE + bytes.fromhex("FFFE 01 00 C105 101E 00030000 2A"), Node(BEACON, None)),  # with NO
+        (bytes.fromhex("1234 0013A20040522BAA 2A") + b"beacon1\x00", Node(BEACON, None)),  # 802.15.4
+        (ZIGBEE, Node(BEACON, None)),  # 802.15.4 without a level
+        (
+            bytes.fromhex("1234 0013A20040522BAA 2A") + b"beacon1\x00" + bytes.fromhex("FFFE 02 00 C105 101E"),
+            Node(BEACON, False),
+        ),  # 802.15.4 of XBee 3, as its command mode prints it
         (b"", None),
-        (ZIGBEE + b"\xff\xfe\x01", None),
         (ZIGBEE[:-1], None),
     ],
 )
 def test_answers_to_the_discovery(data: bytes, node: Node | None) -> None:
     assert parse_node(data) == node
+
+
+def test_names_of_any_bytes_are_different_names_that_the_link_can_hold() -> None:
+    assert [name_of(BEACON, data) for data in (b"beacon1", b"beacon1 ", b" ", b"", b"20 letters, not one ")] == [
+        "beacon1", "beacon1", "0013A20040522BAA", "0013A20040522BAA", "20 letters, not one",
+    ]  # fmt: skip
+    names = {name_of(BEACON, b"k\xfcche" + bytes([byte])) for byte in range(0x80, 0x100)}
+    assert len(names) == 128
+    assert max(map(len, names)) == 6

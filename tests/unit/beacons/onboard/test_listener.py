@@ -5,6 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from ccatp.beacons.config.onboard_load import load_beacon_onboard_config
+from ccatp.beacons.links.cricket_lines import Senders
 from ccatp.beacons.onboard.listener import CricketListener
 from ccatp.onboard.hardware import HardwareError
 from tests.support.beacon_fakes import FakeMote, FakePort, FakeXBee
@@ -17,11 +18,14 @@ class Rig:
     """A mote and its driver."""
 
     def __init__(self, temperature_c: float | None = 23.0) -> None:
-        cfg = load_beacon_onboard_config(None, {"devices.listeners.is_used": True}).devices.listeners
+        settings = {"devices.listeners.is_used": True, "devices.base.is_used": False}
+        cfg = load_beacon_onboard_config(None, settings).devices.listeners
         self.time = FakeTime()
         self.device = FakeMote(self.time, "1:c8:6a:b3:a:0:0:dc", temperature_c)
         self.port: FakePort = self.device
-        self.listener = CricketListener("robot", cfg, lambda *_: self.port.open(), self.time, self.time.sleep)
+        self.listener = CricketListener(
+            "robot", cfg, Senders(), lambda *_: self.port.open(), self.time, self.time.sleep
+        )
 
     def open(self) -> "Rig":
         self.listener.open()
@@ -56,6 +60,24 @@ def test_a_mote_that_repeats_its_time_stamp_counts_once() -> None:
         rig.run(0.1)
     assert len(rig.listener.take()) == 1
     assert rig.listener.reader.counts["duplicates"] == 4
+
+
+def test_lines_that_lack_a_field_and_motes_with_one_name() -> None:
+    rig = Rig().open()
+    other = "1:4c:61:61:b:0:0:1f"
+    for sender, space in ((ID, "ship"), (ID, ""), (ID, "shi")):
+        rig.device.pulse(sender, space, 0.002)
+        rig.run(0.1)
+    assert [burst.sender for burst in rig.listener.take()] == ["ship", "ship"]
+    for _ in range(5):
+        rig.device.pulse(ID, "ship", 0.002)
+        rig.device.pulse(other, "ship", 0.009)
+        rig.run(0.1)
+    rig.listener.take()
+    rig.device.pulse(other, "ship", 0.009)
+    rig.run(0.1)
+    assert not rig.listener.take()
+    assert rig.listener.fault(rig.time.now_s) == "several motes have the space id ship; give each another one (P SP)"
 
 
 def test_silence_is_a_fault_but_a_mote_that_hears_nothing_is_not() -> None:

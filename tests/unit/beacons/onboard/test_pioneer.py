@@ -81,12 +81,15 @@ def test_wheels_turn_as_commanded_in_the_mean_and_encoders_show_it(rig: Rig, rig
     assert not rig.base.fault(rig.time.now_s)
 
 
-def test_counts_wrap(rig: Rig) -> None:
-    rig.device.counts = [2.0**31 - 2000, -(2.0**31) + 2000]
-    rig.run(0.25, 0.0)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_counts_wrap(rig: Rig, sign: float) -> None:
+    rig.device.counts = [-sign * (2.0**31 - 20_000), sign * (2.0**31 - 20_000)]
+    rig.run(0.6, 0.0)
     rig.samples.clear()
-    rig.run(3.0, 1.0, -1.0)
-    assert all(abs(sample[side] or 0.0) < 1.2 for sample in rig.samples for side in (1, 2))
+    rig.run(1.0, 0.0)
+    rig.run(4.0, sign, -sign)
+    assert max(map(abs, rig.device.counts)) > 2.0**31 + 20_000
+    assert [sample[1:] for sample in rig.samples[-30:]] == [pytest.approx((sign, -sign), abs=0.1)] * 30
 
 
 def test_zero_is_sent_at_once_and_nothing_is_carried_over(rig: Rig) -> None:

@@ -149,6 +149,23 @@ def test_a_late_loop_is_held_for_that_step(driver: Driver) -> None:
     assert driver.robot.late_steps == 1
 
 
+def test_pulses_that_came_while_the_loop_stood_are_not_taken_for_new_ones() -> None:
+    cfg = pioneer_config("cricket")
+    rig = BeaconRig(cfg, onboard_config(cfg, devices__listeners__devices={"robot": "/dev/mote"}))
+    robot, mote = DrivenRobot(rig), rig.listeners["robot"]
+    rig._listener = None
+    robot.advance()
+    robot._motes.clear()
+    before = robot.dropped_samples
+    for late_s, taken in ((0.01, 1), (0.3, 0), (0.01, 1)):
+        mote.pulse("1:25:61:61:b:0:0:42", "A", 0.005)
+        rig.time.now_s += late_s
+        robot.control(rig.time.now_s)
+        assert len(robot._motes) == taken
+        robot._motes.clear()
+    assert robot.dropped_samples == before + 1
+
+
 def test_only_a_radio_module_and_only_a_base() -> None:
     driver = Driver(devices__radio__is_used=False, devices__dish__is_used=False)
     assert driver.moves()

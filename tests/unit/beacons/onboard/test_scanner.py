@@ -60,6 +60,7 @@ def test_a_scan_has_a_level_of_each_radio_in_each_direction() -> None:
     rig = Rig()
     assert rig.scanner.is_ready
     assert rig.fake.turned == 0
+    rig.asked.clear()
     began_s = rig.time.now_s
     result = rig.scan()
     assert result is not None

@@ -1,6 +1,6 @@
 """The radio module: which strengths count, discovery, resets, damaged lines, and what else may be on its port."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 
@@ -17,14 +17,16 @@ OTHER = 0x0013A200405200FF
 class Rig:
     """A module with two radios and its driver; ``ask`` requests strengths."""
 
-    def __init__(self, *, api_mode: int = 1, is_zigbee: bool = True, tries: int = 3) -> None:
+    def __init__(
+        self, *, api_mode: int = 1, is_zigbee: bool = True, tries: int = 3, names: Sequence[str] = NAMES
+    ) -> None:
         cfg = load_beacon_onboard_config(
             None,
-            {"devices.radio.names": NAMES, "devices.radio.api_mode": api_mode, "devices.radio.tries": tries},
+            {"devices.radio.names": names, "devices.radio.api_mode": api_mode, "devices.radio.tries": tries},
         ).devices.radio
         self.time = FakeTime()
-        self.levels: dict[str, float | None] = {"beacon1": -40.0, "beacon2": -62.0}
-        self.device = FakeXBee(self.time, NAMES, self.levels.__getitem__)
+        self.levels: dict[str, float | None] = dict(zip(names, (-40.0, -62.0), strict=True))
+        self.device = FakeXBee(self.time, list(names), lambda name: self.levels.get(name, -80.0))
         self.device.api_mode, self.device.is_zigbee = api_mode, is_zigbee
         self.radio = Coordinator(cfg, lambda *_: self.device.open(), self.time, self.time.sleep)
 
@@ -62,6 +64,45 @@ def test_radios_are_found_and_their_strengths_are_their_own(api_mode: int, is_zi
     for level in (-40.0, -17.0, -19.0, -100.0):  # 11 and 13 in hexadecimal are escaped in mode 2
         rig.levels["beacon1"] = level
         assert [rig.ask(name) for name in NAMES] == [level, -62.0]
+
+
+@pytest.mark.parametrize("has_level", [True, False])
+@pytest.mark.parametrize("has_parent", [True, False])
+def test_names_are_right_whatever_the_firmware_writes_beside_them(has_level: bool, has_parent: bool) -> None:
+    rig = Rig(is_zigbee=False)
+    rig.device.has_level, rig.device.has_parent = has_level, has_parent
+    rig.open()
+    assert [rig.ask(name) for name in NAMES] == [-40.0, -62.0]
+
+
+def test_a_slow_line_and_adapter_and_long_names() -> None:
+    names = ["twenty-letters-no-1-x", "twenty-letters-no-2-x"]
+    rig = Rig(names=names, tries=1)
+    rig.device.baud, rig.device.latency_s = 9600, 0.016
+    rig.open()
+    assert [rig.ask(name) for name in names] == [-40.0, -62.0]
+
+
+def test_a_name_that_two_radios_have_is_measured_at_no_time() -> None:
+    """Also while another one is searched again: the two need not answer at once."""
+    rig = Rig()
+    rig.device.nodes = dict.fromkeys((0x0013A20040520001, OTHER), "beacon1")
+    rig.open()
+    assert rig.radio.missing == ["beacon2"]
+    for _ in range(90):
+        assert rig.radio.twins == {"beacon1"}
+        assert rig.ask("beacon1") is None
+        rig.run(0.5)
+    rig.device.nodes[OTHER] = "beacon2"
+    rig.run(30.0)
+    assert [rig.ask(name) for name in NAMES] == [-40.0, -62.0] or rig.radio.twins
+
+
+def test_a_radio_that_has_another_name_now_is_not_measured_under_the_old_one() -> None:
+    rig = Rig().open()
+    rig.device.nodes[0x0013A20040520001] = "beacon9"
+    assert rig.ask("beacon1") is None
+    assert rig.radio.missing == ["beacon1"]
 
 
 def packet_of_another(rig: Rig, kind: int = 0x90) -> Callable[[], None]:
@@ -133,12 +174,22 @@ def test_relayed_packets_are_no_measurement() -> None:
     assert rig.radio.wanted == ["beacon2"]
 
 
+def test_the_node_discovery_does_not_say_that_the_packets_of_a_router_are_not_relayed() -> None:
+    rig = Rig()
+    rig.device.nodes.popitem()
+    rig.open()  # beacon2 is searched again
+    rig.device.frame(b"\xa1" + (0x0013A20040520001).to_bytes(8, "big") + b"\x12\x34\x01\x01\xee\xff")
+    rig.run(40.0)
+    assert rig.radio.relayed == {"beacon1"}
+
+
 def test_a_lost_packet_costs_the_tries_and_then_gives_nothing() -> None:
     rig = Rig(tries=3).open()
     rig.levels["beacon1"] = None
     began_s = rig.time.now_s
     assert rig.ask("beacon1") is None
-    assert rig.time.now_s - began_s == pytest.approx(0.3, abs=0.02)  # answer_timeout_s, three times
+    # Three times answer_timeout_s, and 60 bytes at 9600 baud.
+    assert rig.time.now_s - began_s == pytest.approx(3 * (0.1 + 60 * 10 / 9600), abs=0.02)
     assert rig.ask("beacon2") == -62.0
 
 
@@ -214,6 +265,11 @@ def _other_mode(rig: Rig) -> FakePort:
     return rig.device
 
 
+def _long_search(rig: Rig) -> FakePort:
+    rig.device.search = 130  # as an XBee 3 with 802.15.4
+    return rig.device
+
+
 def _base(rig: Rig) -> FakePort:
     return FakePioneer(rig.time, lambda *_: (0.0, 0.0), lambda: [1.0])
 
@@ -228,6 +284,10 @@ def _mote(rig: Rig) -> FakePort:
         (_mute, "^radio: it does not answer; check its supply, devices.radio.device and devices.radio.baud$"),
         (_garbage, "^radio: garbage at 9600 baud; check devices.radio.baud$"),
         (_other_mode, "^radio: it is in API mode 02; set devices.radio.api_mode, or AP of the module$"),
+        (
+            _long_search,
+            r"^radio: it searches radios for 13 s \(NT\); set devices.radio.discovery_s above, or NT lower$",
+        ),
         (_base, "^radio: a Pioneer base answers on its port; exchange the ports, or correct devices.radio.device$"),
         (_mote, "^radio: a Cricket mote answers on its port; exchange the ports, or correct devices.radio.device$"),
     ],
