@@ -140,7 +140,7 @@ def test_motes_with_one_name_are_refused_and_many_damaged_lines_are_reported(
     log.write_text(whole + "\n".join(line("A", 0.011, k, number="1:99:61:61:b:0:0:42") for k in range(20)))
     said = refused(capsys, "radio", "map", *(text for one in logs for text in ("--cricket", one)))
     assert "A: is the space id of several motes; give each another one (P SP)" in said
-    log.write_text(whole + "\n".join(line("A", 0.011, k)[:60] for k in range(40)))
+    log.write_text(whole + "\n".join(line("A", 0.011, k)[:48] for k in range(40)))
     warning, *more = mapped(capsys, tmp_path, *logs)["warnings"]
     assert not more
     assert warning.startswith("B: 48 samples are damaged or repeat a time stamp")
