@@ -124,6 +124,7 @@ class FakeXBee(FakePort):
         self.extra: list[tuple[bytes, int | None]] = []
         self.strength = 0
         self.search = 60  # NT, 0.1 s
+        self.answer_s = ANSWER_S
         self._host = b""
 
     def reset(self) -> None:
@@ -199,9 +200,9 @@ class FakeXBee(FakePort):
             if level is not None:
                 self.strength = round(-level)
                 answer = b"\x97" + body[1:2] + body[2:10] + b"\x12\x34" + body[13:15] + b"\x00" + name.encode()
-                self.frame(answer, ANSWER_S)
+                self.frame(answer, self.answer_s)
                 for data, strength in self.extra:
-                    self.frame(data, ANSWER_S)
+                    self.frame(data, self.answer_s)
                     self.strength = self.strength if strength is None else strength
                 self.extra.clear()
 

@@ -78,7 +78,7 @@ def test_names_are_right_whatever_the_firmware_writes_beside_them(has_level: boo
 def test_a_slow_line_and_adapter_and_long_names() -> None:
     names = ["twenty-letters-no-1-x", "twenty-letters-no-2-x"]
     rig = Rig(names=names, tries=1)
-    rig.device.baud, rig.device.latency_s = 9600, 0.016
+    rig.device.baud, rig.device.latency_s, rig.device.answer_s = 9600, 0.016, 0.05
     rig.open()
     assert [rig.ask(name) for name in names] == [-40.0, -62.0]
 
