@@ -155,18 +155,20 @@ class OperatorClient:
 
     def ask(self, cmd: str, **fields: str) -> dict[str, Any]:
         """Send a command as it is; returns the whole answer."""
-        return _exchange(self._endpoint("control"), {"cmd": cmd, **fields}, self.timeout_s)
+        return _exchange(self._endpoint("control"), {"cmd": cmd, **fields}, self.timeout_s, has_ended=self._has_ended)
 
     def _order(self, cmd: str) -> MissionStatus:
         return _as(MissionStatus, self.ask(cmd).get("status"))
 
     def _endpoint(self, channel: str) -> str:
-        has_ended = is_held(self.runtime_dir / LOCK_FILE) is False
-        if has_ended or not (self.runtime_dir / channel).exists():
+        if self._has_ended() or not (self.runtime_dir / channel).exists():
             raise DaemonUnreachableError(
                 f"no daemon in {self.runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
             )
         return f"ipc://{self.runtime_dir / channel}"
+
+    def _has_ended(self) -> bool:
+        return is_held(self.runtime_dir / LOCK_FILE) is False
 
 
 def _exchange(
@@ -176,12 +178,13 @@ def _exchange(
     curve: CurveClient | None = None,
     *,
     repeats: bool = False,
+    has_ended: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
     """One request and its answer, as by ``ccatp.links.rpc.request``; ``RefusedError`` where the daemon refuses.
 
     An answer to an emergency that does not confirm that it is in force is a ``RequestFailed``.
     """
-    reply = request(endpoint, json.dumps(payload).encode(), timeout_s, curve, repeats=repeats)
+    reply = request(endpoint, json.dumps(payload).encode(), timeout_s, curve, repeats=repeats, has_ended=has_ended)
     if reply.get("ok") is not True:
         raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
     if payload.get("cmd") == "emergency":

@@ -193,12 +193,14 @@ class CurveClient(NamedTuple):
 
 
 def request(
-    endpoint: str, payload: bytes, timeout_s: float, curve: CurveClient | None = None, *, repeats: bool = False
-) -> dict[str, Any]:
+    endpoint: str, payload: bytes, timeout_s: float, curve: CurveClient | None = None, *, repeats: bool = False,
+    has_ended: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:  # fmt: skip
     """Send a request to a ``Router`` and wait for its reply.
 
     ``curve`` holds the keys for a ``tcp://`` endpoint. ``repeats``: send it every ``REPEAT_S`` until a reply arrives;
-    only for idempotent requests. ``RequestFailed``: no reply in time, an invalid endpoint, or a malformed reply.
+    only for idempotent requests. ``has_ended``: nobody can answer any more. ``RequestFailed``: no reply in time, an
+    invalid endpoint, or a malformed reply.
     """
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.LINGER, 0)
@@ -211,13 +213,16 @@ def request(
             peer.connect(endpoint)
         except zmq.ZMQError as error:
             raise RequestFailed(f"{endpoint}: {error.strerror}") from error
-        period_s = min(REPEAT_S, timeout_s) if repeats else timeout_s
-        for _ in range(max(1, round(timeout_s / period_s))):
+        period_s = min(REPEAT_S, timeout_s)
+        for count in range(max(1, round(timeout_s / period_s))):
             # A full queue holds enough copies already.
             with contextlib.suppress(zmq.Again):
-                peer.send_multipart([b"", payload], zmq.DONTWAIT)
+                if repeats or not count:
+                    peer.send_multipart([b"", payload], zmq.DONTWAIT)
             if peer.poll(max(1, round(period_s * 1000.0))):
                 break
+            if has_ended() and not peer.poll(0):
+                raise RequestFailed(f"{endpoint}: ccatp ended before it answered; ccatp runs show tells how")
         else:
             there = "" if curve is None else " there, with this server key and you listed"
             raise RequestFailed(f"no answer from {endpoint} within {timeout_s:g} s: is ccatp running{there}?")
