@@ -25,6 +25,7 @@ from ccatp.beacons.estimation.landmark_init import (
     AGAIN,
     LEAST,
     LINEARISATIONS,
+    PLACE,
     TRIAL,
     Candidate,
     PendingLandmark,
@@ -33,7 +34,7 @@ from ccatp.beacons.estimation.landmark_init import (
 )
 from ccatp.beacons.estimation.measurement_models import (
     MeasurementModels,
-    MeasurementRow,
+    MeasurementRows,
     is_direction,
     recorded_models,
     scalars_of,
@@ -56,7 +57,6 @@ from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
 
 DELAY = "odometry_delay_s"
-PLACE = 2  # x_m, y_m
 UNITS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -347,13 +347,12 @@ class BeaconSlam:
         return np.array(there.pose[:size]), columns, np.array(J)
 
     def _stacked(self, waiting: PendingLandmark) -> StackedRows:
-        def row_of(kind: str, pose: list[float], calibration: list[float], beacon: list[float]) -> MeasurementRow:
-            row = self._models.by_kind[kind].row(pose, calibration[: self._ranges], beacon, waiting.beacon)
-            row.variance *= self.levels[kind].factor
-            return row
+        def rows_of(kind: str, poses: FloatArray, calibration: list[float], beacons: FloatArray) -> MeasurementRows:
+            rows = self._models.by_kind[kind].rows(poses, calibration[: self._ranges], beacons, waiting.beacon)
+            return rows._replace(variance=rows.variance * self.levels[kind].factor)
 
         walk_m2_s = self.walks_m2_s.get(waiting.beacon, 0.0)
-        return StackedRows(self.engine, waiting.records, self._shared, row_of, walk_m2_s)
+        return StackedRows(self.engine, waiting.records, self._shared, rows_of, walk_m2_s)
 
     def _join(self, waiting: PendingLandmark, found: Candidate) -> None:
         """Add a beacon to the map: an iterated update of the whole state with all of its waiting readings."""

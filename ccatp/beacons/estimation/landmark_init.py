@@ -3,23 +3,25 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import cycle
 from math import cos, hypot, inf, isfinite, pi, sin, sqrt
 from statistics import median
 from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.estimation.measurement_models import MeasurementRow, scalars_of
+from ccatp.beacons.estimation.measurement_models import MeasurementRows, scalars_of
 from ccatp.beacons.estimation.motion import POSE
 from ccatp.beacons.estimation.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.beacons.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
-from ccatp.core import FloatArray
+from ccatp.core import FloatArray, IntArray
 from ccatp.kinematics import wrap_pi
 
-# From kind, pose, calibration and states of the beacon to a row.
-RowOf = Callable[[str, list[float], list[float], list[float]], MeasurementRow]
+# From kind, poses (m, 3), calibration and states of the beacon (m, b) to rows.
+RowsOf = Callable[[str, FloatArray, list[float], FloatArray], MeasurementRows]
 PriorAt = Callable[[float, float], BeaconEstimate]
 
+PLACE = 2  # x_m, y_m
 MOST = 24  # most readings of a beacon that are kept; above, every other one is dropped and the spacing is doubled
 LEAST = 8  # readings needed before a beacon without bearings is searched: four times the unknowns of its place
 SPACING = 0.01  # initial distance between kept readings, relative to the range
@@ -88,33 +90,79 @@ class StackedRows:
     """
 
     def __init__(
-        self, engine: EkfSlam, records: Sequence[ReadingRecord], shared: slice, row_of: RowOf, walk_m2_s: float = 0.0
+        self, engine: EkfSlam, records: Sequence[ReadingRecord], shared: slice, rows_of: RowsOf, walk_m2_s: float = 0.0
     ) -> None:
         self.blocks = [engine.block(record.place) for record in records]
         self.columns = columns_of(*self.blocks, shared)
-        self._shared, self._row_of = shared, row_of
+        self._shared, self._rows_of = shared, rows_of
         starts = np.cumsum([0, *(block.stop - block.start for block in self.blocks)]).tolist()
-        # A beacon that moves was elsewhere at the earlier readings.
-        self._scalars = [
-            (kind, z, block, start, walk_m2_s * (records[-1].reading.time_s - record.reading.time_s))
+        scalars = [
+            (kind, z, block, start, records[-1].reading.time_s - record.reading.time_s)
             for record, block, start in zip(records, self.blocks, starts, strict=False)
             for kind, z in scalars_of(record.reading)
         ]
-        self.size, self._shared_start = len(self._scalars), starts[-1]
+        self.size, self._shared_start = len(scalars), starts[-1]
+        kinds = np.array([kind for kind, *_ in scalars])
+        self._of_kind: dict[str, slice | IntArray] = {
+            kind: np.flatnonzero(kinds == kind) for kind in set(kinds.tolist())
+        }
+        if len(self._of_kind) == 1:  # NumPy takes a slice far sooner than indices
+            self._of_kind = dict.fromkeys(self._of_kind, slice(None))
+        self._z = np.array([z for _, z, *_ in scalars])
+        # Each pose or place, in the state and in the columns; the heading of a place counts as zero.
+        self._places = np.array([range(block.start, block.start + PLACE) for _, _, block, *_ in scalars])
+        self._place_columns = np.array([range(start, start + PLACE) for *_, start, _ in scalars])
+        self._numbers = np.arange(self.size)[:, None]
+        self._posed = np.flatnonzero([block.stop - block.start == POSE for _, _, block, *_ in scalars])
+        # A beacon that moves was elsewhere at the earlier readings.
+        self._moved_m2 = walk_m2_s * np.array([before_s for *_, before_s in scalars]) if walk_m2_s > 0.0 else None
 
     def at(self, x: FloatArray, beacon: list[float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """At a state x (n,): derivatives by ``columns`` (m, k) and by the beacon (m, b), z - h (m,), variances (m,)."""
-        m, calibration, first = self.size, x[self._shared].tolist(), self._shared_start
-        H, G, e, R = np.zeros((m, self.columns.size)), np.zeros((m, len(beacon))), np.zeros(m), np.zeros(m)
-        for i, (kind, z, block, start, moved_m2) in enumerate(self._scalars):
-            pose: list[float] = x[block].tolist()
-            size = len(pose)
-            row = self._row_of(kind, [*pose, 0.0][:POSE], calibration, beacon)
-            H[i, start : start + size] = row.pose[:size]
-            H[i, first : first + len(row.calibration)] = row.calibration
-            G[i], R[i] = row.beacon, row.variance + moved_m2 * (row.beacon[0] ** 2 + row.beacon[1] ** 2)
-            e[i] = wrap_pi(z - row.expected) if kind == "bearing" else z - row.expected
+        H, first = np.zeros((self.size, self.columns.size)), self._shared_start
+        G, e, R = np.empty((self.size, len(beacon))), np.empty(self.size), np.empty(self.size)
+        poses, states = self._poses(x), np.empty_like(G)
+        states[:] = beacon
+        for kind, at in self._of_kind.items():
+            rows = self._rows_of(kind, poses[at], x[self._shared].tolist(), states[at])
+            H[at, first : first + rows.calibration.shape[1]] = rows.calibration
+            G[at], R[at], e[at] = rows.beacon, self._variances(rows, at), self._z[at] - rows.expected
+            poses[at] = rows.pose
+            if kind == "bearing":
+                e[at] = [wrap_pi(off) for off in e[at].tolist()]
+        H[self._numbers, self._place_columns] = poses[:, :PLACE]
+        if self._posed.size:
+            H[self._posed, self._place_columns[self._posed, 0] + PLACE] = poses[self._posed, PLACE]
         return H, G, e, R
+
+    def misfits(self, x: FloatArray, beacons: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals z - h and variances as by ``at``, both (s, m), for s states of the beacon, (s, b)."""
+        poses, calibration = self._poses(x), x[self._shared].tolist()
+        e, R = np.empty((len(beacons), self.size)), np.empty((len(beacons), self.size))
+        for kind, at in self._of_kind.items():
+            of_kind = poses[at]
+            states = np.repeat(beacons, len(of_kind), axis=0)
+            rows = self._rows_of(kind, np.tile(of_kind, (len(beacons), 1)), calibration, states)
+            e[:, at] = self._z[at] - rows.expected.reshape(len(beacons), -1)
+            R[:, at] = self._variances(rows, at).reshape(len(beacons), -1)
+            if kind == "bearing":
+                e[:, at] = [[wrap_pi(off) for off in one] for one in e[:, at].tolist()]
+        return e, R
+
+    def _poses(self, x: FloatArray) -> FloatArray:
+        poses = np.zeros((self.size, POSE))
+        poses[:, :PLACE] = x[self._places]
+        if self._posed.size:
+            poses[self._posed, PLACE] = x[self._places[self._posed, 0] + PLACE]
+        return poses
+
+    def _variances(self, rows: MeasurementRows, at: slice | IntArray) -> FloatArray:
+        """Variances of the readings, and of the motion of the beacon since each one."""
+        if self._moved_m2 is None:
+            return rows.variance
+        slopes = zip(cycle(self._moved_m2[at].tolist()), rows.beacon.tolist(), strict=False)
+        moved = [m2 * (gx**2 + gy**2) for m2, (gx, gy, *_) in slopes]
+        return np.asarray(rows.variance + moved)
 
 
 @dataclass(slots=True)
@@ -242,10 +290,8 @@ class _Problem(NamedTuple):
         """
         angles = [2.0 * pi * k / STARTS for k in range(STARTS)]
         ring = [prior_at(place[0] + radius_m * cos(angle), place[1] + radius_m * sin(angle)) for angle in angles]
-        costs = []
-        for prior in ring:
-            _, _, e, R = self.rows.at(self.x, prior.mean.tolist())
-            costs.append(float(np.log1p(e * e / R).sum()))
+        e, R = self.rows.misfits(self.x, np.array([prior.mean for prior in ring]))
+        costs = [float(of_one.sum()) for of_one in np.log1p(e * e / R)]
         return [ring[k] for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
 
     def refine(self, prior: BeaconEstimate, start: FloatArray | None = None) -> Candidate | None:

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.beacons.config.models import RadioConfig, ScanConfig, SlamFilterConfig
-from ccatp.beacons.estimation.beacon_slam import PLACE, BeaconInnovation, BeaconSlam
-from ccatp.beacons.estimation.landmark_init import PendingLandmark, StackedRows
+from ccatp.beacons.estimation.beacon_slam import BeaconInnovation, BeaconSlam
+from ccatp.beacons.estimation.landmark_init import PLACE, PendingLandmark, StackedRows
 from ccatp.beacons.estimation.measurement_models import BearingModel, LevelModel, MeasurementModels, ShadowingMap
 from ccatp.beacons.estimation.motion import POSE, Odometry, SlippingVehicle, VehiclePose
 from ccatp.beacons.estimation.path_loss import PathLoss

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import atan2, cos, hypot, log10, sin
+from math import atan2, cos, hypot, log10, nan, sin
 from time import perf_counter
 
 import numpy as np
@@ -16,10 +16,12 @@ from ccatp.beacons.estimation.batch_smoother import lagged_run, smooth
 from ccatp.beacons.estimation.beacon_slam import BeaconSlam, recorded_slam
 from ccatp.beacons.estimation.causal import filter_run, follow
 from ccatp.beacons.estimation.evaluation import judge, result_data
+from ccatp.beacons.estimation.landmark_init import ReadingRecord, StackedRows
 from ccatp.beacons.estimation.measurement_models import (
     LevelModel,
     MeasurementModel,
     MeasurementRow,
+    MeasurementRows,
     ShadowingMap,
     recorded_models,
 )
@@ -27,7 +29,7 @@ from ccatp.beacons.estimation.motion import Increment
 from ccatp.beacons.estimation.path_loss import PathLoss
 from ccatp.beacons.estimation.recording import BeaconId, EstimatedPath, Reading, RecordedRun, Steps
 from ccatp.beacons.estimation.track_review import range_residuals
-from ccatp.beacons.filters.ekf_slam import BlockError
+from ccatp.beacons.filters.ekf_slam import BlockError, EkfSlam
 from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
 from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
@@ -298,6 +300,38 @@ def test_jacobian_of_a_row(kind: str) -> None:
     by_pose = [0.0] * 3 if "map" in kind else row.pose
     by_calibration = row.calibration or (0.0, 0.0)
     assert [*by_pose, *by_calibration, *row.beacon] == pytest.approx(differences, abs=1e-7)
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_rows_of_many_readings_are_those_of_each_one(kind: str) -> None:
+    poses = np.random.default_rng(3).uniform(-3.0, 3.0, (200, 3))
+    beacons = np.tile([*BEACON, *EXTRA.get(kind, ())], (200, 1)) + 0.1 * poses[:, :1]
+    rows = MODELS[kind].rows(poses, CALIBRATION, beacons, "b")
+    for k, (pose, beacon) in enumerate(zip(poses.tolist(), beacons.tolist(), strict=True)):
+        row = MODELS[kind].row(pose, CALIBRATION, beacon, "b")
+        for name in rows._fields:
+            np.testing.assert_array_equal(getattr(rows, name)[k], getattr(row, name))
+
+
+@pytest.mark.parametrize("walk_m2_s", [0.0, 0.01])
+def test_misfits_of_many_places_are_those_of_each_one(walk_m2_s: float) -> None:
+    places = np.random.default_rng(4).uniform(-3.0, 3.0, (4, 2))
+    engine, records = EkfSlam(np.zeros(3), np.eye(3), np.array(CALIBRATION), np.eye(2)), []
+    for k, place in enumerate(places):
+        engine.augment(k, place, np.arange(2), np.eye(2, 2))
+        records.append(ReadingRecord(Reading(float(k), "b", 4.0 if k % 2 else nan, None, -40.0), k, 4.0))
+
+    def rows_of(kind: str, poses: FloatArray, calibration: list[float], beacons: FloatArray) -> MeasurementRows:
+        found = MODELS[kind].rows(poses, calibration, beacons, "b")
+        return found if kind == "rssi" else found._replace(beacon=np.pad(found.beacon, ((0, 0), (0, 2))))
+
+    rows = StackedRows(engine, records, slice(3, 5), rows_of, walk_m2_s)
+    beacons = np.column_stack([5.0 + places, np.tile(EXTRA["rssi"], (4, 1))])
+    e, R = rows.misfits(engine.mean, beacons)
+    for k, beacon in enumerate(beacons.tolist()):
+        _, _, residuals, variances = rows.at(engine.mean, beacon)
+        np.testing.assert_array_equal(e[k], residuals)
+        np.testing.assert_array_equal(R[k], variances)
 
 
 CONFIG = load_recordings_config(None, {})
