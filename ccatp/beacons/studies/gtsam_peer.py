@@ -6,7 +6,7 @@ bearings start at a place found by trilateration on GTSAM's own path. Each beaco
 one so wide that it only keeps the equations regular while few readings have weight.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -42,24 +42,17 @@ class PeerGaveUp(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-class Peers(NamedTuple):
-    """The estimates of GTSAM; for iSAM2 each pose is from the readings up to it, and the map is that at the end."""
-
-    isam2: EstimatedPath
-    batch: EstimatedPath
-
-
 Progress = Callable[[int], Callable[[int], None]]  # from the number of instants: what is called with those done
 
 
 def run_gtsam(
     run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float], limit_s: float,
     progress: Progress = lambda _: lambda _: None,
-) -> Peers:  # fmt: skip
-    """Both estimates of a run. ``limit_s``: longest time of iSAM2, s.
+) -> Iterator[EstimatedPath]:  # fmt: skip
+    """The estimates of a run: of iSAM2, then of the batch, which begins with it. ``limit_s``: longest time of each, s.
 
-    Raises PeerError: gtsam is not installed. Raises PeerGaveUp: its optimisation failed, a reading has no range, or the
-    time is over.
+    For iSAM2 each pose is from the readings up to it, and the map is that at the end. Raises PeerError: gtsam is not
+    installed. Raises PeerGaveUp: its optimisation failed, a reading has no range, or the time is over.
     """
     gtsam = import_gtsam()
     if not np.isfinite(run.readings.range_m).all():
@@ -69,7 +62,7 @@ def run_gtsam(
     if run.tags and np.isfinite(run.readings.bearing_rad).any():
         raise PeerGaveUp(f"{run.name}: GTSAM has no factor of a bearing by one of several tags")
     try:
-        return _Session(gtsam, run, settings).solve(clock_s, limit_s, progress)
+        yield from _Session(gtsam, run, settings).solve(clock_s, limit_s, progress)
     except RuntimeError as error:
         raise PeerGaveUp(f"{run.name}: GTSAM gave up: {' '.join(str(error).split())[:120]}") from error
 
@@ -135,7 +128,7 @@ class _Session:
         self._waiting: dict[int, list[int]] = {}
         self._path = np.empty((len(self._times), 3))
 
-    def solve(self, clock_s: Callable[[], float], limit_s: float, progress: Progress) -> Peers:
+    def solve(self, clock_s: Callable[[], float], limit_s: float, progress: Progress) -> Iterator[EstimatedPath]:
         gtsam, run = self._gtsam, self._run
         show, started_s = progress(len(self._times)), clock_s()
         isam = gtsam.ISAM2(gtsam.ISAM2Params())
@@ -172,14 +165,29 @@ class _Session:
                     "run: run.peer_limit_s allows more"
                 )
         final = isam.calculateEstimate()
-        isam2 = self._track(self._path, final, np.array(took))
+        yield self._track(self._path, final, np.array(took))
         begin_s = clock_s()
-        best = gtsam.LevenbergMarquardtOptimizer(self._graph, final).optimize()
+        how = self._stopped_at(limit_s, clock_s)
+        best = gtsam.LevenbergMarquardtOptimizer(self._graph, final, how).optimize()
         # time of the optimisation only: iSAM2 gives its initial values
         spent = clock_s() - begin_s
         poses = np.array([(q.x(), q.y(), q.theta()) for q in map(best.atPose2, map(self._x, range(len(self._times))))])
         share = np.array([spent / max(len(self._at), 1)])
-        return Peers(isam2, self._track(poses, best, share))
+        yield self._track(poses, best, share)
+
+    def _stopped_at(self, limit_s: float, clock_s: Callable[[], float]) -> Any:
+        """Parameters of the batch that end it after a step beyond the limit."""
+        begin_s, how = clock_s(), self._gtsam.LevenbergMarquardtParams()
+
+        def look(steps: int, _before: float, _after: float) -> None:
+            if clock_s() - begin_s > limit_s:
+                raise PeerGaveUp(
+                    f"{self._run.name}: GTSAM's batch was stopped after {limit_s:g} s and {steps} steps: "
+                    "run.peer_limit_s allows more"
+                )
+
+        how.iterationHook = look
+        return how
 
     def _know(self, graph: Any, values: Any) -> None:
         """Beacons of a known map, each with its own covariance."""

@@ -4,8 +4,9 @@ The estimators are our own ones, and with ``--peers`` those of GTSAM.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -88,20 +89,24 @@ def compared(
 ) -> list[dict[str, Any]]:
     """A row of ``COMPARED`` for dead reckoning, each of our estimators, and GTSAM's.
 
-    If GTSAM fails, its rows have no values, and there is a warning. Raises PeerError: GTSAM is not installed.
+    If GTSAM fails, its remaining rows have no values, and there is a warning. Raises PeerError: GTSAM is not installed.
     """
     import_gtsam()  # fails before the computation
     tracks: list[tuple[str, EstimatedPath | None, float | None]] = [(RECKONING, reckoned_track(run), None)]
     for name in FILTERS[:-1] if run.moving else FILTERS:  # the smoother has no model of beacons that move
         begin_s = perf_counter()
         tracks.append((name, estimate(run, assumed, name), perf_counter() - begin_s))
+    peers = run_gtsam(run, getattr(assumed, run.kind), perf_counter, assumed.run.peer_limit_s, progress)
+    names = list(PEERS)
     try:
-        isam2, batch = run_gtsam(run, getattr(assumed, run.kind), perf_counter, assumed.run.peer_limit_s, progress)
-        # The batch starts from the result of iSAM2, so its time is not that of a run.
-        tracks += [(PEERS[0], isam2, float(isam2.update_s.sum())), (PEERS[1], batch, None)]
+        while names:
+            found = next(peers)
+            # The batch starts from the result of iSAM2, so its time is not that of a run.
+            run_s = float(found.update_s.sum()) if names[0] == PEERS[0] else None
+            tracks.append((names.pop(0), found, run_s))
     except PeerGaveUp as error:
         warn([str(error)])
-        tracks += [(name, None, None) for name in PEERS]
+        tracks += [(name, None, None) for name in names]
     rows = []
     for name, track, run_s in tracks:
         data = {} if track is None else result_data(run, name, track, judge(track, run))
@@ -159,13 +164,18 @@ def _on_robot(job: Job, robot: int | None, share: float) -> dict[str, float | No
     if estimator in FILTERS:
         track = estimate(run, cfg, estimator)
     else:
-        peers = run_gtsam(run, getattr(cfg, run.kind), perf_counter, cfg.run.peer_limit_s)
-        track = peers[PEERS.index(estimator)]
+        tracks = run_gtsam(run, getattr(cfg, run.kind), perf_counter, cfg.run.peer_limit_s)
+        track = peer_track(tracks, estimator)
     run_s = perf_counter() - begin_s
     data = result_data(run, estimator, track, judge(track, run))
     late = data["delayed"] or dict.fromkeys(_DELAYED.values())
     row: dict[str, float | None] = {key: data[value] for key, value in (_ERRORS | _SHOWN).items()}
     return row | {key: late[value] for key, value in _DELAYED.items()} | {"run_s": run_s}
+
+
+def peer_track(tracks: Iterator[EstimatedPath], name: str) -> EstimatedPath:
+    """That of the estimates of ``run_gtsam`` with a name of ``PEERS``; the batch is not computed without need."""
+    return next(islice(tracks, PEERS.index(name), None))
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

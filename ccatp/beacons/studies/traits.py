@@ -15,7 +15,7 @@ from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.estimation.evaluation import RECKONING, judge, reckoned_track, truth_at
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp, run_gtsam
-from ccatp.beacons.studies.recordings import FILTERS, PEERS, EstimateError, estimate
+from ccatp.beacons.studies.recordings import FILTERS, PEERS, EstimateError, estimate, peer_track
 from ccatp.beacons.studies.trait_runs import TRAITS, trait_run
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import nees, rms
@@ -43,8 +43,8 @@ def run_trait(job: Job) -> JobOutcome:
     values: dict[str, Any] = {"run_s": perf_counter() - begin_s, **_errors(track, run)}
     if (peer := job.factors.get("peer")) is not None:
         try:
-            peers = run_gtsam(run, job.cfg.csv, perf_counter, job.cfg.run.peer_limit_s)
-            values["peer"] = _errors(peers[PEERS.index(str(peer))], run)
+            tracks = run_gtsam(run, job.cfg.csv, perf_counter, job.cfg.run.peer_limit_s)
+            values["peer"] = _errors(peer_track(tracks, str(peer)), run)
         except PeerGaveUp:
             values["peer_gave_up"] = True
     if estimator in FILTERS:

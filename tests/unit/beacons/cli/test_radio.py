@@ -249,13 +249,13 @@ def no_clock() -> float:
 def test_both_solve_a_run_without_calibration_errors(bearings: bool) -> None:
     pytest.importorskip("gtsam", reason="the extra peers is not installed")
     run = recorded(world(seconds=60.0), bearings=bearings)
-    peers = run_gtsam(run, SETTINGS, no_clock, np.inf)
-    for track in peers:
+    isam2, batch = run_gtsam(run, SETTINGS, no_clock, np.inf)
+    for track in (isam2, batch):
         found = judge(track, run)
         assert found.trajectory_rmse_m == pytest.approx(0.0, abs=0.1)
         assert found.beacon_rmse_m == pytest.approx(0.0, abs=0.15)
         assert set(track.beacons) == set(BEACONS)
-    assert len(peers.isam2.update_s) == len(run.readings.times_s)
+    assert len(isam2.update_s) == len(run.readings.times_s)
 
 
 def test_what_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,12 +264,12 @@ def test_what_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
     nothing = np.full(len(run.readings.times_s), np.nan)
     received = replace(run, readings=run.readings._replace(range_m=nothing, rssi_dbm=nothing - 50.0))
     with pytest.raises(PeerGaveUp, match="no factor of signal strengths"):
-        run_gtsam(received, SETTINGS, no_clock, np.inf)
+        next(run_gtsam(received, SETTINGS, no_clock, np.inf))
     with pytest.raises(PeerGaveUp, match=r"^simulated: GTSAM gave up: .*$"):
-        run_gtsam(replace(run, first_pose=(np.nan, 0.0, 0.0)), SETTINGS, no_clock, np.inf)
+        next(run_gtsam(replace(run, first_pose=(np.nan, 0.0, 0.0)), SETTINGS, no_clock, np.inf))
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(PeerError, match=r"ccatp\[peers\]"):
-        run_gtsam(run, SETTINGS, no_clock, np.inf)
+        next(run_gtsam(run, SETTINGS, no_clock, np.inf))
 
 
 def test_a_slow_peer_tells_how_far_it_is_and_stops_at_the_limit() -> None:
@@ -283,9 +283,27 @@ def test_a_slow_peer_tells_how_far_it_is_and_stops_at_the_limit() -> None:
     with pytest.raises(
         PeerGaveUp, match=r"^simulated: GTSAM was stopped after 30 s, at 1\d% of the run: run.peer_limit"
     ):
-        run_gtsam(run, SETTINGS, lambda: float(next(ticks)), 30.0, progress)
+        next(run_gtsam(run, SETTINGS, lambda: float(next(ticks)), 30.0, progress))
     assert shown[0] == len(run.readings.times_s) + 1
     assert shown[1:] == [*range(1, len(shown))]
+
+
+def test_a_batch_that_is_stopped_leaves_the_result_of_isam2() -> None:
+    pytest.importorskip("gtsam", reason="the extra peers is not installed")
+    now_s, tick_s = 0.0, 0.0
+
+    def clock_s() -> float:
+        nonlocal now_s
+        now_s += tick_s
+        return now_s
+
+    tracks = run_gtsam(recorded(world(seconds=20.0)), SETTINGS, clock_s, 0.5)
+    assert set(next(tracks).beacons) == set(BEACONS)
+    tick_s = 1.0
+    with pytest.raises(
+        PeerGaveUp, match=r"^simulated: GTSAM's batch was stopped after 0.5 s and 1 steps: run.peer_lim"
+    ):
+        next(tracks)
 
 
 def test_a_peer_takes_a_known_map() -> None:
