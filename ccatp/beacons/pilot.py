@@ -161,8 +161,8 @@ class ObstacleAvoider:
         if is_free(wanted_rad):
             return wanted_rad
         headings = (wrap_pi(k * tau / self._cfg.directions) for k in range(self._cfg.directions))
-        free = [heading_rad for heading_rad in headings if is_free(heading_rad)]
-        return min(free, key=lambda h: abs(wrap_pi(h - wanted_rad)) + 0.1 * abs(h), default=None)
+        nearest_first = sorted(headings, key=lambda h: abs(wrap_pi(h - wanted_rad)) + 0.1 * abs(h))
+        return next(filter(is_free, nearest_first), None)
 
     def _speed_factor(self, near: Sequence[tuple[float, float]]) -> float:
         cfg = self._cfg

@@ -78,31 +78,42 @@ class MoteField:
         self._temperatures_c = true.temperature_c + rng.normal(0.0, true.thermometer_sigma_c, len(motes.names))
         ratio = (true.temperature_c - _ABSOLUTE_ZERO_C) / (cfg.air.temperature_c - _ABSOLUTE_ZERO_C)
         self._sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
+        self._distances_m = dict[tuple[int, int], float | None]()
 
     def receives(self, transmitter: int, listener: int) -> bool:
         """Whether the distance of two motes is within the usable range of their transducers and directions."""
-        places, facings = self.motes.positions_m, self.motes.facings
-        way = places[listener] - places[transmitter]
-        distance_m = float(np.linalg.norm(way))
-        if self._cfg.layout == "random" and distance_m > self._cfg.random.reach_m:
-            return False
-        off = _off_axis(facings[transmitter], way), _off_axis(facings[listener], -way)
-        return self._cfg.transducer.nearest_m <= distance_m <= usable_reach(self._cfg.transducer, *off)
+        return self._received_from_m(transmitter, listener) is not None
+
+    def _received_from_m(self, transmitter: int, listener: int) -> float | None:
+        """Distance of two motes; None if it is not within the usable range."""
+        pair = transmitter, listener
+        if pair not in self._distances_m:  # motes stand still
+            places, facings = self.motes.positions_m, self.motes.facings
+            way = places[listener] - places[transmitter]
+            distance_m = float(np.linalg.norm(way))
+            off = _off_axis(facings[transmitter], way), _off_axis(facings[listener], -way)
+            reach_m = usable_reach(self._cfg.transducer, *off)
+            if self._cfg.layout == "random":
+                reach_m = min(reach_m, self._cfg.random.reach_m)
+            is_within = self._cfg.transducer.nearest_m <= distance_m <= reach_m
+            self._distances_m[pair] = distance_m if is_within else None
+        return self._distances_m[pair]
 
     def listen(self, pairs: Sequence[tuple[int, int]], repeats: int, rng: np.random.Generator) -> list[MotePulse]:
         """Readings of pairs; a pair without reception is left out."""
         received = []
         for transmitter, listener in pairs:
-            if not self.receives(transmitter, listener):
+            distance_m = self._received_from_m(transmitter, listener)
+            if distance_m is None:
                 continue
-            delays_s = self._delays(transmitter, listener, repeats, rng)
+            delays_s = self._delays(distance_m, repeats, rng)
             if delays_s.size:
                 received.append(MotePulse(transmitter, listener, delays_s, float(self._temperatures_c[listener])))
         return received
 
-    def _delays(self, transmitter: int, listener: int, repeats: int, rng: np.random.Generator) -> FloatArray:
+    def _delays(self, distance_m: float, repeats: int, rng: np.random.Generator) -> FloatArray:
         true = self._cfg.sim
-        ways_m = np.full(repeats, float(np.linalg.norm(np.subtract(*self.motes.positions_m[[transmitter, listener]]))))
+        ways_m = np.full(repeats, distance_m)
         is_echo = rng.random(repeats) < true.multipath_probability
         ways_m[is_echo] += rng.exponential(true.multipath_excess_m, int(is_echo.sum()))
         ways_m += rng.normal(0.0, true.sigma_m, repeats)
