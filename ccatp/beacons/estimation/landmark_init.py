@@ -119,35 +119,31 @@ class StackedRows:
 
     def at(self, x: FloatArray, beacon: list[float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """At a state x (n,): derivatives by ``columns`` (m, k) and by the beacon (m, b), z - h (m,), variances (m,)."""
-        H, first = np.zeros((self.size, self.columns.size)), self._shared_start
-        G, e, R = np.empty((self.size, len(beacon))), np.empty(self.size), np.empty(self.size)
-        poses, states = self._poses(x), np.empty_like(G)
-        states[:] = beacon
-        for kind, at in self._of_kind.items():
-            rows = self._rows_of(kind, poses[at], x[self._shared].tolist(), states[at])
-            H[at, first : first + rows.calibration.shape[1]] = rows.calibration
-            G[at], R[at], e[at] = rows.beacon, self._variances(rows, at), self._z[at] - rows.expected
-            poses[at] = rows.pose
-            if kind == "bearing":
-                e[at] = [wrap_pi(off) for off in e[at].tolist()]
-        H[self._numbers, self._place_columns] = poses[:, :PLACE]
-        if self._posed.size:
-            H[self._posed, self._place_columns[self._posed, 0] + PLACE] = poses[self._posed, PLACE]
-        return H, G, e, R
+        H, G, e, R = self.at_each(x, np.array([beacon]))
+        return H[0], G[0], e[0], R[0]
 
-    def misfits(self, x: FloatArray, beacons: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals z - h and variances as by ``at``, both (s, m), for s states of the beacon, (s, b)."""
+    def at_each(self, x: FloatArray, beacons: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """The same for s states of the beacon, (s, b): shapes (s, m, k), (s, m, b), (s, m), (s, m)."""
+        count, first = len(beacons), self._shared_start
+        H, G = np.zeros((count, self.size, self.columns.size)), np.empty((count, self.size, beacons.shape[1]))
+        e, R, by_pose = np.empty(G.shape[:2]), np.empty(G.shape[:2]), np.empty((*G.shape[:2], POSE))
         poses, calibration = self._poses(x), x[self._shared].tolist()
-        e, R = np.empty((len(beacons), self.size)), np.empty((len(beacons), self.size))
         for kind, at in self._of_kind.items():
             of_kind = poses[at]
-            states = np.repeat(beacons, len(of_kind), axis=0)
-            rows = self._rows_of(kind, np.tile(of_kind, (len(beacons), 1)), calibration, states)
-            e[:, at] = self._z[at] - rows.expected.reshape(len(beacons), -1)
-            R[:, at] = self._variances(rows, at).reshape(len(beacons), -1)
+            n = len(of_kind)
+            states = np.repeat(beacons, n, axis=0)
+            rows = self._rows_of(kind, np.tile(of_kind, (count, 1)), calibration, states)
+            c = rows.calibration.shape[1]
+            H[:, at, first : first + c] = rows.calibration.reshape(count, n, c)
+            G[:, at], by_pose[:, at] = rows.beacon.reshape(count, n, -1), rows.pose.reshape(count, n, POSE)
+            e[:, at] = self._z[at] - rows.expected.reshape(count, n)
+            R[:, at] = self._variances(rows, at).reshape(count, n)
             if kind == "bearing":
                 e[:, at] = [[wrap_pi(off) for off in one] for one in e[:, at].tolist()]
-        return e, R
+        H[:, self._numbers, self._place_columns] = by_pose[:, :, :PLACE]
+        if self._posed.size:
+            H[:, self._posed, self._place_columns[self._posed, 0] + PLACE] = by_pose[:, self._posed, PLACE]
+        return H, G, e, R
 
     def _poses(self, x: FloatArray) -> FloatArray:
         poses = np.zeros((self.size, POSE))
@@ -224,18 +220,16 @@ class PendingLandmark:
         if pointed is not None:
             prior = prior_at(*pointed)
             start = self.candidates[0].mean if self.candidates else np.array([*pointed, *prior.mean[2:]])
-            likely = problem.refine(prior, start)
-            self.candidates = [] if likely is None else [likely]
+            self.candidates = problem.refined([prior], start[None])
             return
         starts = [BeaconEstimate(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
         # The last range may be a reflection: the median is tried, too.
         for radius_m in {reach_m, median([record.distance_m for record in self.records])}:
             starts = [*problem.around(prior_at, places[-1], radius_m), *starts]
-        found = [candidate for candidate in map(problem.refine, starts) if candidate is not None]
+        found = problem.refined(starts)
         best = min(found, key=lambda c: c.cost, default=None)
         if best is not None:
-            mirrored = problem.refine(prior_at(*_mirrored(np.array(places), best.mean[:2])))
-            found += [] if mirrored is None else [mirrored]
+            found += problem.refined([prior_at(*_mirrored(np.array(places), best.mean[:2]))])
         found.sort(key=lambda c: c.cost)
         apart: list[Candidate] = []
         for candidate in found:
@@ -290,37 +284,55 @@ class _Problem(NamedTuple):
         """
         angles = [2.0 * pi * k / STARTS for k in range(STARTS)]
         ring = [prior_at(place[0] + radius_m * cos(angle), place[1] + radius_m * sin(angle)) for angle in angles]
-        e, R = self.rows.misfits(self.x, np.array([prior.mean for prior in ring]))
+        _, _, e, R = self.rows.at_each(self.x, np.array([prior.mean for prior in ring]))
         costs = [float(of_one.sum()) for of_one in np.log1p(e * e / R)]
         return [ring[k] for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
 
-    def refine(self, prior: BeaconEstimate, start: FloatArray | None = None) -> Candidate | None:
-        """Gauss-Newton from ``start``, or from the prior's mean; None if it diverges."""
-        b, W, stride = prior.mean if start is None else start, np.linalg.inv(prior.covariance), 0.5 * self.reach_m
-        variances, A, cost = b, W, inf
-        for k in range(ITERATIONS):
-            H, G, e, R = self.rows.at(self.x, b.tolist())
-            spread = H.dot(self.P).dot(H.T)
-            variances, left_out = _weighed(e, spread.diagonal() + R, R, k if self.is_robust else 0)
-            S = spread + np.diag(variances)
-            SG = np.linalg.solve(S, G)
-            A = G.T.dot(SG) + W
-            step = np.linalg.solve(A, SG.T.dot(e) + W.dot(prior.mean - b))
-            size = hypot(step[0], step[1])
-            cost = float(e.dot(np.linalg.solve(S, e))) + left_out
-            if not (isfinite(cost) and isfinite(size)):
-                return None
-            if size < 1e-3 * stride and (k > ROBUST or not self.is_robust):
-                break
-            b = b + step * min(1.0, stride / max(size, 1e-12))
-        C = np.linalg.inv(A)
-        return Candidate(b, C, cost, variances, self._bend(b, C) if self.is_robust else 0.0)
+    def refined(self, priors: Sequence[BeaconEstimate], starts: FloatArray | None = None) -> list[Candidate]:
+        """Gauss-Newton from ``starts`` (s, b), or from the means of the priors; without those that diverge.
 
-    def _bend(self, b: FloatArray, C: FloatArray) -> float:
-        _, G, _, R = self.rows.at(self.x, b.tolist())
-        x, y = (b[:2] - np.array([self.x[block][:2] for block in self.rows.blocks])).T
-        across = (C[0, 0] * y * y - 2.0 * C[0, 1] * x * y + C[1, 1] * x * x) / (x * x + y * y)
-        return float((0.5 * np.hypot(G[:, 0], G[:, 1]) * across / (np.hypot(x, y) * np.sqrt(R))).max())
+        All steps are made side by side: each one costs little, and calling NumPy for it costs more.
+        """
+        means, W = np.array([prior.mean for prior in priors]), np.linalg.inv([prior.covariance for prior in priors])
+        b, A = (means if starts is None else starts).copy(), W.copy()
+        going, ended, stride = [*range(len(b))], dict[int, tuple[float, FloatArray]](), 0.5 * self.reach_m
+        for k in range(ITERATIONS):
+            H, G, e, R = self.rows.at_each(self.x, b[going])
+            S = H @ self.P @ H.transpose(0, 2, 1)
+            innovations, diagonals = S.diagonal(axis1=1, axis2=2) + R, S.reshape(len(S), -1)[:, :: R.shape[1] + 1]
+            weighed = [_weighed(*each, k if self.is_robust else 0) for each in zip(e, innovations, R, strict=True)]
+            diagonals += [variances for variances, _ in weighed]
+            SG, Se = np.linalg.solve(S, G), np.linalg.solve(S, e[:, :, None])[:, :, 0]
+            A[going] = G.transpose(0, 2, 1) @ SG + W[going]
+            sides = [SG[i].T.dot(e[i]) + W[one].dot(means[one] - b[one]) for i, one in enumerate(going)]
+            steps, still = np.linalg.solve(A[going], np.array(sides)[:, :, None])[:, :, 0], list[int]()
+            for i, one in enumerate(going):
+                variances, left_out = weighed[i]
+                size, cost = hypot(steps[i, 0], steps[i, 1]), float(e[i].dot(Se[i])) + left_out
+                if not (isfinite(cost) and isfinite(size)):
+                    ended.pop(one, None)
+                    continue
+                ended[one] = cost, variances
+                if size < 1e-3 * stride and (k > ROBUST or not self.is_robust):
+                    continue
+                b[one] += steps[i] * min(1.0, stride / max(size, 1e-12))
+                still.append(one)
+            if not (going := still):
+                break
+        if not ended:
+            return []
+        good = sorted(ended)
+        C = np.linalg.inv(A[good])
+        bends = self._bends(b[good], C) if self.is_robust else [0.0] * len(good)
+        return [Candidate(b[one], C[i], ended[one][0], ended[one][1], bends[i]) for i, one in enumerate(good)]
+
+    def _bends(self, b: FloatArray, C: FloatArray) -> list[float]:
+        _, G, _, R = self.rows.at_each(self.x, b)
+        x, y = (b[:, :2, None] - np.array([self.x[block][:2] for block in self.rows.blocks]).T).transpose(1, 0, 2)
+        C = C[:, :, :, None]
+        across = (C[:, 0, 0] * y * y - 2.0 * C[:, 0, 1] * x * y + C[:, 1, 1] * x * x) / (x * x + y * y)
+        bends = 0.5 * np.hypot(G[:, :, 0], G[:, :, 1]) * across / (np.hypot(x, y) * np.sqrt(R))
+        return [float(bend) for bend in bends.max(axis=1)]
 
 
 def _mirrored(places: FloatArray, point: FloatArray) -> tuple[float, float]:
@@ -342,6 +354,6 @@ def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[Fl
     if step < ROBUST:
         return R + S * np.maximum(sigmas / KNEE - 1.0, 0.0), 0.0
     # relative to the median residual, not to the configured noise: a wrong place must not leave out all that contradict
-    limit = KNEE * max(1.0, MEDIAN_TO_SIGMA * float(np.median(sigmas)))
+    limit = KNEE * max(1.0, MEDIAN_TO_SIGMA * median(sigmas.tolist()))
     is_out = sigmas > limit
     return R + np.where(is_out, OUT * e * e, 0.0), limit**2 * float(is_out.sum())

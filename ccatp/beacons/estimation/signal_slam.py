@@ -271,14 +271,14 @@ class _RowsInRoom(StackedRows):
         self._rows, self._within_m, self._variances_m2 = rows, within_m, np.full(PLACE, variance_m2)
         self.blocks, self.columns = rows.blocks, rows.columns
 
-    def at(self, x: FloatArray, beacon: list[float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def at_each(self, x: FloatArray, beacons: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """The rows of the readings, followed by one row for each coordinate of the place."""
-        H, G, e, R = self._rows.at(x, beacon)
-        place = np.array(beacon[:PLACE])
-        inwards = np.clip(place, *self._within_m) - place
-        walls = np.eye(PLACE, len(beacon)) * (inwards != 0.0)[:, None]
-        H = np.pad(H, ((0, PLACE), (0, 0)))
-        return H, np.vstack([G, walls]), np.append(e, inwards), np.append(R, self._variances_m2)
+        H, G, e, R = self._rows.at_each(x, beacons)
+        places = beacons[:, :PLACE]
+        inwards = np.clip(places, *self._within_m) - places
+        walls = np.eye(PLACE, beacons.shape[1]) * (inwards != 0.0)[:, :, None]
+        H, variances_m2 = np.pad(H, ((0, 0), (0, PLACE), (0, 0))), np.tile(self._variances_m2, (len(beacons), 1))
+        return H, np.hstack([G, walls]), np.hstack([e, inwards]), np.hstack([R, variances_m2])
 
 
 _TYPICAL = 0.4  # mean distance of two points in a square, over its diagonal: 0.521 / sqrt(2), rounded up

@@ -314,7 +314,7 @@ def test_rows_of_many_readings_are_those_of_each_one(kind: str) -> None:
 
 
 @pytest.mark.parametrize("walk_m2_s", [0.0, 0.01])
-def test_misfits_of_many_places_are_those_of_each_one(walk_m2_s: float) -> None:
+def test_rows_at_many_places_are_those_at_each_one(walk_m2_s: float) -> None:
     places = np.random.default_rng(4).uniform(-3.0, 3.0, (4, 2))
     engine, records = EkfSlam(np.zeros(3), np.eye(3), np.array(CALIBRATION), np.eye(2)), []
     for k, place in enumerate(places):
@@ -327,11 +327,10 @@ def test_misfits_of_many_places_are_those_of_each_one(walk_m2_s: float) -> None:
 
     rows = StackedRows(engine, records, slice(3, 5), rows_of, walk_m2_s)
     beacons = np.column_stack([5.0 + places, np.tile(EXTRA["rssi"], (4, 1))])
-    e, R = rows.misfits(engine.mean, beacons)
+    found = rows.at_each(engine.mean, beacons)
     for k, beacon in enumerate(beacons.tolist()):
-        _, _, residuals, variances = rows.at(engine.mean, beacon)
-        np.testing.assert_array_equal(e[k], residuals)
-        np.testing.assert_array_equal(R[k], variances)
+        for of_all, of_one in zip(found, rows.at(engine.mean, beacon), strict=True):
+            np.testing.assert_array_equal(of_all[k], of_one)
 
 
 CONFIG = load_recordings_config(None, {})
