@@ -16,13 +16,13 @@ from ccatp.beacons.links.arcos_packets import (
     CONFIG,
     ENABLE,
     ENCODER,
-    GREETING,
     OPEN,
     RVEL,
     SETA,
     SETRA,
     SONAR,
     STANDARD_PACKETS,
+    STOP,
     SYNC0,
     SYNC2,
     VEL,
@@ -75,7 +75,7 @@ class PioneerBase(BeaconDevice):
         self._impossible_rad_s = _IMPOSSIBLE * body.max_wheel_rad_s
         self._jumps_s: deque[float] = deque(maxlen=_JUMPS)
         self.reader = PacketReader()
-        self._stage = SYNC0
+        self._stage = self._attempts = SYNC0
         self._settings: deque[tuple[int, int]] = deque()  # commands that are not sent yet
         self._ask_s = self._enable_s = self._standard_s = self._counts_s = -inf
         self._last: tuple[int, int] | None = None  # counts at the newest sample of the wheels,
@@ -105,7 +105,8 @@ class PioneerBase(BeaconDevice):
         self._restart(now_s)
 
     def _restart(self, now_s: float) -> None:
-        self._stage, self._ask_s, self._last = SYNC0, now_s, None
+        self._stage = self._attempts = SYNC0
+        self._ask_s, self._last = now_s, None
         self._standard_s = self._counts_s = -inf
         self._ranges = {}
         self._settings.clear()
@@ -125,8 +126,11 @@ class PioneerBase(BeaconDevice):
             self._new_counts = None
         if self._stage < _RUNS and now_s >= self._ask_s:
             self._ask_s = now_s + ASK_S
-            question = CONFIG if self._stage == _CONFIGURES else self._stage
-            self._line.write(GREETING if self._stage == SYNC0 else format_command(question))
+            if self._stage == SYNC0:  # or what follows it, in a handshake that another program has begun
+                self._line.write(format_command(STOP) + format_command(self._attempts % _CONFIGURES))
+                self._attempts += 1
+            else:
+                self._line.write(format_command(CONFIG if self._stage == _CONFIGURES else self._stage))
         elif self._stage == _RUNS and now_s - self._line.valid_s > CLOSED_S:
             self._restart(now_s)  # it was switched off, or restarted
         elif self._settings:  # one in each step: the base may lose commands that follow each other within 5 ms
@@ -138,12 +142,12 @@ class PioneerBase(BeaconDevice):
             if kind in STANDARD_PACKETS:  # the session of a program that died is still open
                 self._line.write(format_command(CLOSE))
                 self._stage, self._ask_s = SYNC0, now_s + CLOSED_S
-            elif kind == self._stage:
+            elif self._stage <= kind <= SYNC2:
                 if kind == SYNC2:
                     name, base, model = parse_names(packet)
                     self._identity = f"{base} {model} {name}".strip()
                     self._line.write(format_command(OPEN))
-                self._stage += 1
+                self._stage = kind + 1
                 self._ask_s = now_s
         elif self._stage == _CONFIGURES and (watchdog_s := parse_watchdog_s(packet)) is not None:
             if not 0.0 < watchdog_s <= config.most_watchdog_s:

@@ -9,6 +9,7 @@ import pytest
 
 from ccatp.beacons.config.onboard_load import load_beacon_onboard_config
 from ccatp.beacons.config.onboard_models import BeaconOnboardConfig
+from ccatp.beacons.links.arcos_packets import format_command
 from ccatp.beacons.onboard.pioneer import PioneerBase
 from ccatp.onboard.hardware import HardwareError
 from tests.support.beacon_fakes import FakePioneer, FakePort, FakeXBee
@@ -211,6 +212,17 @@ def test_the_session_of_a_program_that_died_is_closed_first() -> None:
     assert rig.device.velocity == 0.0
     rig.run(0.3)
     assert not rig.base.fault(rig.time.now_s)
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_a_handshake_that_was_broken_off_goes_on(stage: int) -> None:
+    """A program was killed in it, or a driver of another device asked who is there."""
+    rig = Rig()
+    for number in range(stage):
+        rig.device.take(format_command(number))
+    rig.open().run(0.5, 1.0, 1.0)
+    assert rig.base.is_ready
+    assert rig.base.identity == "Pioneer p3dx-sh Bradley_1, watchdog 0.5 s"
 
 
 def test_a_base_that_is_switched_off_and_on(rig: Rig) -> None:
