@@ -11,12 +11,12 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ccatp.beacons.config.models import CricketConfig
+from ccatp.beacons.config.onboard_models import COLDEST_C, HOTTEST_C
 from ccatp.beacons.rigid_motion import RigidMotion, best_motion
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 
 ABSOLUTE_ZERO_C = -273.15
-COLDEST_C, HOTTEST_C = -60.0, 80.0  # beyond, a thermometer is broken
 
 
 class TdoaError(ValueError):

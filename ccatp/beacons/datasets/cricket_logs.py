@@ -10,7 +10,7 @@ from ccatp.beacons.config.models import CricketConfig
 from ccatp.beacons.cricket.measured_map import MeasuredRanges
 from ccatp.beacons.cricket.range_network import MoteRange, TdoaError, delay_at, pair_range
 from ccatp.beacons.datasets.tables import RadioDataError
-from ccatp.beacons.links.cricket_lines import LineReader, MoteReport, Pulse, Senders
+from ccatp.beacons.links.cricket_lines import ASK_REPORT, LineReader, MoteReport, Pulse, Senders
 from ccatp.config.files import read_input
 from ccatp.onboard.devices.linux import open_serial
 from ccatp.onboard.devices.serial_line import SerialPort
@@ -18,7 +18,6 @@ from ccatp.onboard.hardware import HardwareError
 
 BAUD = 115200
 _MOST_BYTES = 50_000_000
-_ASK = b"\rG CF\r"  # the mote reports its name and its temperature
 _WAIT_S = 0.02
 _MANY = 0.1  # share of the samples that are damaged or repeated, which is reported
 
@@ -67,7 +66,7 @@ def _live(
         port = open_port(device, BAUD, "--cricket")
         try:
             with suppress(OSError):  # it may only send
-                port.write(_ASK)
+                port.write(ASK_REPORT)
             end_s = time.monotonic() + seconds
             while time.monotonic() < end_s:
                 pulses += reader.feed(port.read(4096))

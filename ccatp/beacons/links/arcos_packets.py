@@ -60,9 +60,13 @@ def format_command(command: int, value: int | None = None) -> bytes:
     return format_packet(bytes([command, kind]) + abs(value).to_bytes(2, "little"))
 
 
-# Begins a handshake. A base whose watchdog has expired in a session that is still open resumes its last motion with the
-# next packet, whatever it is: so the first one is STOP.
-GREETING = format_command(STOP) + format_command(SYNC0)
+def format_greeting(stage: int = SYNC0) -> bytes:
+    """Begins a handshake, or continues one that another program has begun.
+
+    A base whose watchdog has expired in a session that is still open resumes its last motion with the next packet,
+    whatever it is: so the first one is ``STOP``.
+    """
+    return format_command(STOP) + format_command(stage)
 
 
 class PacketReader(FrameFinder):

@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from typing import NamedTuple
 
+ASK_REPORT = b"\rG CF\r"  # the mote reports its name and its temperature
 LONGEST_LINE, LONGEST_NAME = 256, 16  # a space id has at most 8 letters
 SLOWEST_M_S, FASTEST_M_S = 300.0, 370.0  # speed of sound between -50 and 70 degrees
 LONGEST_FLIGHT_S = 0.045  # after which a mote waits for no pulse

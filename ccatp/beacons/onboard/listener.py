@@ -3,7 +3,7 @@
 from math import inf
 
 from ccatp.beacons.config.onboard_models import COLDEST_C, HOTTEST_C, ListenersConfig
-from ccatp.beacons.links.cricket_lines import LineReader, Senders
+from ccatp.beacons.links.cricket_lines import ASK_REPORT, LineReader, Senders
 from ccatp.beacons.links.messages import MoteBurst
 from ccatp.beacons.onboard.recognition import BeaconDevice
 from ccatp.onboard.devices.serial_device import Clock, Sleep
@@ -12,7 +12,6 @@ from ccatp.onboard.hardware import HardwareError
 
 ASK_S = 2.0  # of silence, after which the mote is asked for its report
 REPORT_S = 60.0  # between two reports: they hold the temperature
-_REPORT_COMMAND = b"\rG CF\r"
 _USELESS = 10  # damaged and repeated lines without one that is right, which are a fault
 _DIGITS = 6
 
@@ -78,7 +77,7 @@ class CricketListener(BeaconDevice):
 
     def _ask(self, now_s: float) -> None:
         self._ask_s, self._report_s = now_s + ASK_S, now_s + REPORT_S
-        self._line.write(_REPORT_COMMAND)
+        self._line.write(ASK_REPORT)
 
     def _receive(self, data: bytes, now_s: float) -> None:
         super()._receive(data, now_s)

@@ -22,13 +22,13 @@ from ccatp.beacons.links.arcos_packets import (
     SETRA,
     SONAR,
     STANDARD_PACKETS,
-    STOP,
     SYNC0,
     SYNC2,
     VEL,
     PacketReader,
     Standard,
     format_command,
+    format_greeting,
     parse_encoders,
     parse_names,
     parse_standard,
@@ -127,7 +127,7 @@ class PioneerBase(BeaconDevice):
         if self._stage < _RUNS and now_s >= self._ask_s:
             self._ask_s = now_s + ASK_S
             if self._stage == SYNC0:  # or what follows it, in a handshake that another program has begun
-                self._line.write(format_command(STOP) + format_command(self._attempts % _CONFIGURES))
+                self._line.write(format_greeting(self._attempts % _CONFIGURES))
                 self._attempts += 1
             else:
                 self._line.write(format_command(CONFIG if self._stage == _CONFIGURES else self._stage))

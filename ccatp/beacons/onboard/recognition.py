@@ -2,15 +2,15 @@
 
 from math import inf
 
-from ccatp.beacons.links.arcos_packets import GREETING, PacketReader
-from ccatp.beacons.links.cricket_lines import LineReader
+from ccatp.beacons.links.arcos_packets import PacketReader, format_greeting
+from ccatp.beacons.links.cricket_lines import ASK_REPORT, LineReader
 from ccatp.beacons.links.xbee_frames import FrameReader, format_at, format_frame
 from ccatp.onboard.devices.serial_device import SerialDevice
 
 ANSWER_S = 4.0
 PATIENCE_S = 8.0  # for the answer of a device
 # What each device answers to, and what the others ignore.
-QUESTIONS = format_frame(format_at(1, b"AP"), is_escaped=False) + GREETING + b"\rG CF\r"
+QUESTIONS = format_frame(format_at(1, b"AP"), is_escaped=False) + format_greeting() + ASK_REPORT
 _SEEN_BYTES = 512  # that are kept to recognize another device
 
 

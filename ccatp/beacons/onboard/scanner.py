@@ -50,9 +50,7 @@ class Scanner:
 
     Attributes:
         fault: reason why no scan is possible now; empty if it is.
-        silence: of which radios the newest scan has no level, and why; empty if it has a level of each.
-        interrupted: reason of the newest scan that gave nothing.
-        counts: ``scans``, ``interrupted``.
+        silence: why the newest scan gave nothing, or has no level of some radios; empty if it has a level of each.
     """
 
     def __init__(
@@ -67,9 +65,8 @@ class Scanner:
         self._directions = 1 if dish is None else config.positions
         self._step_s = self._settled_s = self._reopen_s = 0.0
         self._result: ScanResult | None = None
-        self.fault = self.interrupted = self.silence = ""
+        self.fault = self.silence = ""
         self._failures: Counter[str] = Counter()  # of requests before the scan
-        self.counts: Counter[str] = Counter(scans=0, interrupted=0)
 
     @property
     def is_ready(self) -> bool:
@@ -118,9 +115,7 @@ class Scanner:
         """The scan gives nothing; the dish turns back."""
         if not self.is_scanning or not self._levels:
             return
-        self.interrupted = reason
         self.silence = f"the newest scan gave nothing: {reason}"
-        self.counts["interrupted"] += 1
         self._levels = {}
         self._phase = Phase.READY if self._dish is None else Phase.RETURNING
 
@@ -219,7 +214,6 @@ class Scanner:
 
     def _finish(self, now_s: float) -> None:
         """Radios that did not answer once, or turned out not to be measurable meanwhile, are left out."""
-        self.counts["scans"] += 1
         received = {name: self._levels[name] for name in self._coordinator.wanted if any(self._levels.get(name, ()))}
         self._note_silence()
         t_s = round(now_s, _DIGITS)

@@ -137,7 +137,7 @@ def test_a_robot_that_is_pushed_in_a_scan_gives_no_scan() -> None:
     assert scanner.is_scanning
     driver.rig.base.counts[0] += 5000.0
     driver.run(2)
-    assert scanner.interrupted == "the robot moved"
+    assert scanner.silence == "the newest scan gave nothing: the robot moved"
     assert not any("scan" in frame for frame in driver.run(60))
 
 
