@@ -280,8 +280,9 @@ CYCLE_S = 0.1
 class FakePioneer(FakePort):
     """A Pioneer base: handshake, watchdog, packets of each cycle; ``move`` drives the wheels for a cycle.
 
-    ``move`` takes travel (m/s) and turn (rad/s), and gives those that the encoders measure. sonar_m: readings. When
-    its watchdog expires it halts, and with the next packet it resumes its motion, as the manuals say.
+    ``move`` takes travel (m/s) and turn (rad/s), and gives those that the encoders measure. sonar_m: readings, all in
+    each cycle; with ``baud`` five, in turn, as of two rings that send a pulse each 40 ms. When its watchdog
+    expires it halts, and with the next packet it resumes its motion, as the manuals say.
     """
 
     def __init__(
@@ -300,6 +301,7 @@ class FakePioneer(FakePort):
         self.stalls, self.bumpers = [False, False], [0, 0]
         self.is_enabled = self.stop_pressed = False
         self.numbers: list[int] | None = None  # of sonars that read; None: all
+        self._turn = 0
         self.expired = 0
         self._expires_s: float | None = None
         self.power_on()
@@ -393,6 +395,9 @@ class FakePioneer(FakePort):
         body += bytes([self.stalls[0] | rear << 1, self.stalls[1] | front << 1])
         body += bytes(2) + (int(self.is_enabled) | 2).to_bytes(2, "little") + b"\x00"
         ranges_m = dict(enumerate(self._sonars_m()))
+        if self.baud is not None:
+            self.numbers = [(self._turn + k) % len(ranges_m) for k in range(5)]
+            self._turn += 5
         shown = {n: r for n, r in ranges_m.items() if self.numbers is None or n in self.numbers}
         body += bytes([len(shown)])
         body += b"".join(bytes([n]) + min(round(1e3 * r), 5000).to_bytes(2, "little") for n, r in shown.items())
