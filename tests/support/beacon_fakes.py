@@ -297,6 +297,7 @@ class FakePioneer(FakePort):
         self.counts_per_mm = 128.0
         self.counts = [0.0, 0.0]  # left, right
         self.watchdog_ms = 500
+        self.ticks_mm = 128
         self.battery_v = 12.5
         self.stalls, self.bumpers = [False, False], [0, 0]
         self.is_enabled = self.stop_pressed = False
@@ -353,7 +354,8 @@ class FakePioneer(FakePort):
         elif command == 18:
             numbers = b"".join(n.to_bytes(2, "little") for n in (500, 1500, 300, 2000, 500))
             settings = b"\x00\x02\x00" + b"\x00\x00\x01\x00\x00" + (115).to_bytes(2, "little")
-            settings += (16570).to_bytes(2, "little") + self.watchdog_ms.to_bytes(2, "little") + bytes(40)
+            settings += (16570).to_bytes(2, "little") + self.watchdog_ms.to_bytes(2, "little") + bytes(43)
+            settings += self.ticks_mm.to_bytes(2, "little") + bytes(20)
             self.packet(b"\x20Pioneer\x00p3dx-sh\x00SN42\x00\x04" + numbers + b"Bradley_1\x00" + settings)
         elif command == 4:
             self.is_enabled = value == 1

@@ -114,17 +114,27 @@ def parse_names(packet: bytes) -> tuple[str, str, str]:
     return name, kind, model
 
 
+class Settings(NamedTuple):
+    """Parameters in the flash memory of a base; ``counts_per_mm``: None where it does not tell."""
+
+    watchdog_s: float
+    counts_per_mm: int | None
+
+
 # Between the serial number and the name: one byte, five numbers. Between the name and the watchdog: SIP cycle, three
 # bytes for baud rates without the last, gripper (2), front sonar (2), rear sonar (1), low battery (2), RevCount (2).
-_BEFORE_NAME, _BEFORE_WATCHDOG = 1 + 5 * 2, 3 + 2 + 2 + 1 + 2 + 2
+# Between the watchdog and TicksMM: one byte, 16 numbers, six bytes, drift of the gyroscope (2), two baud rates.
+_BEFORE_NAME, _BEFORE_WATCHDOG, _BEFORE_TICKS = 1 + 5 * 2, 3 + 2 + 2 + 1 + 2 + 2, 1 + 16 * 2 + 6 + 2 + 2
+_SETTINGS = struct.Struct(f"<{_BEFORE_WATCHDOG}xH{_BEFORE_TICKS}xH")
 
 
-def parse_watchdog_s(packet: bytes) -> float | None:
-    """The watchdog in the packet that answers ``CONFIG``; None if it is none or too short."""
+def parse_settings(packet: bytes) -> Settings | None:
+    """The packet that answers ``CONFIG``; None if it is none or too short."""
     if packet[0] != CONFIG_PACKET:
         return None
     parts = packet[1:].split(b"\0", 3)  # type, model, serial number, and what follows them
     _, zero, rest = parts[-1][_BEFORE_NAME:].partition(b"\0")
     if len(parts) < 4 or not zero or len(rest) < _BEFORE_WATCHDOG + 2:
         return None
-    return 1e-3 * int.from_bytes(rest[_BEFORE_WATCHDOG : _BEFORE_WATCHDOG + 2], "little")
+    watchdog_ms, counts_per_mm = _SETTINGS.unpack_from(rest.ljust(_SETTINGS.size, b"\0"))
+    return Settings(1e-3 * watchdog_ms, counts_per_mm or None)

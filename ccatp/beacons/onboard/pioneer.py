@@ -31,8 +31,8 @@ from ccatp.beacons.links.arcos_packets import (
     format_greeting,
     parse_encoders,
     parse_names,
+    parse_settings,
     parse_standard,
-    parse_watchdog_s,
 )
 from ccatp.beacons.onboard.recognition import BeaconDevice
 from ccatp.onboard.devices.serial_device import Clock, Sleep
@@ -45,6 +45,7 @@ _CONFIGURES, _RUNS = SYNC2 + 1, SYNC2 + 2  # stages after those of the handshake
 _DEGREE_RAD = pi / 180.0
 SEND_S = 0.05  # between two commands with the same set points
 _ENABLE_S = 1.0  # in which the base enables its motors
+_OTHER_SCALE = 0.1  # of TicksMM: wheels that were measured differ less
 _DISAGREES = 0.5  # of the base's own speed, by which the encoders may differ from it
 _FAST_MM_S = 60.0  # speeds above are compared
 _CONTINUOUS = 2
@@ -149,7 +150,13 @@ class PioneerBase(BeaconDevice):
                     self._line.write(format_command(OPEN))
                 self._stage = kind + 1
                 self._ask_s = now_s
-        elif self._stage == _CONFIGURES and (watchdog_s := parse_watchdog_s(packet)) is not None:
+        elif self._stage == _CONFIGURES and (settings := parse_settings(packet)) is not None:
+            watchdog_s, counts_per_mm = settings
+            if counts_per_mm is not None and abs(config.counts_per_mm / counts_per_mm - 1.0) > _OTHER_SCALE:
+                raise HardwareError(
+                    f"{self._identity}: its TicksMM is {counts_per_mm}; correct devices.base.counts_per_mm, "
+                    f"which is {config.counts_per_mm:g}"
+                )
             if not 0.0 < watchdog_s <= config.most_watchdog_s:
                 raise HardwareError(
                     f"{self._identity}: its watchdog is {watchdog_s:g} s; set WatchDog of the base to at most "

@@ -162,6 +162,12 @@ def test_a_base_that_waits_too_long_is_refused() -> None:
         rig.open()
 
 
+def test_a_base_with_another_scale_is_refused() -> None:
+    assert Rig(counts_per_mm=133.0).open().base.is_ready  # as the user has measured it
+    with pytest.raises(HardwareError, match=r"TicksMM is 128; correct devices.base.counts_per_mm, which is 100$"):
+        Rig(counts_per_mm=100.0).open()
+
+
 def test_sonars_in_the_order_of_the_configuration(rig: Rig) -> None:
     rig.run(0.3)
     assert rig.base.distances_m(rig.time.now_s) == pytest.approx([0.5 + 0.1 * k for k in (7, 6, 5, 4, 3, 2, 1, 0)])
@@ -253,10 +259,14 @@ def test_any_byte_of_a_packet_may_get_lost(rig: Rig) -> None:
 
 
 def test_encoders_that_contradict_the_base_are_a_fault() -> None:
-    rig = Rig(counts_per_mm=60.0).open()
+    rig = Rig(counts_per_mm=60.0)
+    rig.device.ticks_mm = 0  # it does not tell
+    rig.open()
     rig.run(3.0, 2.0, 2.0)
     assert "contradict the speeds of the base; correct devices.base.counts_per_mm" in rig.base.fault(rig.time.now_s)
-    rig = Rig(counts_per_mm=12.8).open()
+    rig = Rig(counts_per_mm=12.8)
+    rig.device.ticks_mm = 0
+    rig.open()
     rig.run(3.0, 2.0, 2.0)
     assert rig.base.fault(rig.time.now_s).startswith("the encoders show impossible speeds; check their cables")
 
