@@ -41,7 +41,7 @@ def test_plaza2_smoothed() -> None:
         assert warning in reported
 
 
-@pytest.mark.parametrize("share", [0.1, 0.4])
+@pytest.mark.parametrize("share", [pytest.param(0.1, marks=pytest.mark.slow), 0.4])
 def test_plaza2_started_later(share: float) -> None:
     """The filter, and the fixed-lag smoother; of four tenths a beacon joined 16 m off and its path was 3.2 m off."""
     run = recorded_window(str(DATA), "Plaza2", None, share * PLAZA2_S, PLAZA2_S)

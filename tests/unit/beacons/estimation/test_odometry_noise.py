@@ -53,7 +53,9 @@ def found_in(run: RecordedRun) -> OdometryNoise:
         problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, used)
         state, _ = descend(problem, state, 20)
         factored = Factored(problem.normal_equations(state, np.ones(len(run.readings.times_s))))
-        noise = odometry_noise(problem, state, factored, RIGHT.odometry, noise, OdometryNoise())
+        before, noise = noise, odometry_noise(problem, state, factored, RIGHT.odometry, noise, OdometryNoise())
+        if np.allclose(noise, before, rtol=0.01):
+            break
     return noise
 
 

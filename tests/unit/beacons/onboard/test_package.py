@@ -84,36 +84,58 @@ def test_the_installed_command_is_there(site: Path) -> None:
     assert os.access(site / "bin" / "ccatp-onboard", os.X_OK)
 
 
-@pytest.mark.parametrize(
-    ("settings", "status", "message"),
-    [
-        ('devices.base.device = "/dev/nowhere"', 5, "ccatp: base: /dev/nowhere: is not there; check the wiring"),
-        ('devices.base.device = "/dev/null"', 5, "ccatp: base: /dev/null: "),  # no serial port
-        ("devices.base.is_used = false\ndevices.radio.device = '/dev/nowhere'", 5,
-         "ccatp: radio: /dev/nowhere: is not there; check the wiring"),
-        ("devices.dish.positions = 7", 2, "devices.dish.positions must divide steps_per_turn = 200"),
-        ("devices.radio.bauds = 9600", 2, "devices.radio.bauds"),
-        ("devices.radio.is_used = false", 2, "devices.dish.is_used needs devices.radio"),
-        ("devices.base.is_used = false\ndevices.radio.is_used = false\ndevices.dish.is_used = false", 2,
-         "devices.base.is_used is false, as of all other devices"),
-        ("devices.base.sonars = [1, 1, 2, 3, 4, 5, 6, 7]", 2, "devices.base.sonars names a sonar twice"),
-        (f"devices.radio.names = {[f'b{k}' for k in range(21)]}", 2,
-         "devices.radio.names times devices.dish.positions exceeds 800 levels"),
-        ("devices.base.baud = 4800", 2, "devices.base.baud"),
-        ("devices.listeners.is_used = true", 2, "devices.base.baud lets packets take 0.06 s"),
-        ("devices.radio.api_mode = 0", 2, "devices.radio.api_mode"),
-        ("devices.base.most_watchdog_s = 0.01", 2, "devices.base.most_watchdog_s stops a loop"),
-    ],
-)  # fmt: skip
-def test_started_bare_it_names_what_is_missing(
-    site: Path, tmp_path: Path, settings: str, status: int, message: str
-) -> None:
-    config = tmp_path / "robot.toml"
-    config.write_text('kind = "beacons"\nlink.port = 0\nlink.host = "127.0.0.1"\n' + settings + "\n")
-    done = run(site, START, "--config", str(config))
-    assert done.returncode == status, done.stderr
-    assert message in done.stderr.splitlines()[-1]
-    assert "Traceback" not in done.stderr
+# What the configuration says, the status that the program ends with, and what it says last.
+MISSING = [
+    ('devices.base.device = "/dev/nowhere"', 5, "ccatp: base: /dev/nowhere: is not there; check the wiring"),
+    ('devices.base.device = "/dev/null"', 5, "ccatp: base: /dev/null: "),  # no serial port
+    ("devices.base.is_used = false\ndevices.radio.device = '/dev/nowhere'", 5,
+     "ccatp: radio: /dev/nowhere: is not there; check the wiring"),
+    ("devices.dish.positions = 7", 2, "devices.dish.positions must divide steps_per_turn = 200"),
+    ("devices.radio.bauds = 9600", 2, "devices.radio.bauds"),
+    ("devices.radio.is_used = false", 2, "devices.dish.is_used needs devices.radio"),
+    ("devices.base.is_used = false\ndevices.radio.is_used = false\ndevices.dish.is_used = false", 2,
+     "devices.base.is_used is false, as of all other devices"),
+    ("devices.base.sonars = [1, 1, 2, 3, 4, 5, 6, 7]", 2, "devices.base.sonars names a sonar twice"),
+    (f"devices.radio.names = {[f'b{k}' for k in range(21)]}", 2,
+     "devices.radio.names times devices.dish.positions exceeds 800 levels"),
+    ("devices.base.baud = 4800", 2, "devices.base.baud"),
+    ("devices.listeners.is_used = true", 2, "devices.base.baud lets packets take 0.06 s"),
+    ("devices.radio.api_mode = 0", 2, "devices.radio.api_mode"),
+    ("devices.base.most_watchdog_s = 0.01", 2, "devices.base.most_watchdog_s stops a loop"),
+]  # fmt: skip
+# Imported once: each configuration is started in a fork of the process, which sees nothing of the others.
+START_EACH = """
+import os, sys
+import ccatp.beacons.onboard.kind, ccatp.onboard.program
+from ccatp.cli.onboard import main
+for config in sys.argv[1:]:
+    if not (child := os.fork()):
+        sys.argv[1:] = ["--config", config]
+        os.dup2(os.open(config + ".err", os.O_WRONLY | os.O_CREAT), 2)
+        sys.exit(main())
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def started(site: Path, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, str]]:
+    """Status and standard error of the program for each row of ``MISSING``."""
+    folder = tmp_path_factory.mktemp("missing")
+    configs = [folder / f"{number}.toml" for number in range(len(MISSING))]
+    for config, (settings, *_) in zip(configs, MISSING, strict=True):
+        config.write_text('kind = "beacons"\nlink.port = 0\nlink.host = "127.0.0.1"\n' + settings + "\n")
+    done = run(site, START_EACH, *map(str, configs))
+    assert done.returncode == 0, done.stderr
+    statuses = [int(line) for line in done.stdout.split()]
+    return [(status, Path(f"{config}.err").read_text()) for status, config in zip(statuses, configs, strict=True)]
+
+
+@pytest.mark.parametrize("number", range(len(MISSING)), ids=[message for *_, message in MISSING])
+def test_started_bare_it_names_what_is_missing(started: list[tuple[int, str]], number: int) -> None:
+    (status, error), (_, expected, message) = started[number], MISSING[number]
+    assert status == expected, error
+    assert message in error.splitlines()[-1]
+    assert "Traceback" not in error
 
 
 def test_the_kind_of_another_robot_is_not_installed(site: Path, tmp_path: Path) -> None:
