@@ -11,7 +11,8 @@ _NOTHING: dict[str, object] = {
     **{
         f"priors__{name}": 0.0
         for name in ("distance_scale", "distance_per_rad", "turn_scale", "turn_bias_rad_s", "odometry_delay_s",
-                     "range_scale", "range_offset_m", "rssi_reference_db", "beacon_reference_db", "rssi_exponent")
+                     "range_scale", "range_offset_m", "rssi_reference_db", "beacon_reference_db", "rssi_exponent",
+                     "beacon_height_m2", "antenna_ahead_m", "antenna_left_m")
     },
     "filter__turn_bias_walk_rad_s_sqrt_s": 0.0,
     "filter__rest_speed_m_s": 0.0,

@@ -137,7 +137,8 @@ FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
 UNUSED_BY = {
     "ekf-slam": (
         "FORMAT.priors.turn_per_m", "FORMAT.priors.bearing_offset_rad", "FORMAT.priors.beacon_offset_m",
-        "FORMAT.priors.core", "FORMAT.radio.freedom", "fixed_lag",
+        "FORMAT.priors.core", "FORMAT.priors.beacon_height_m2", "FORMAT.priors.antenna_ahead_m",
+        "FORMAT.priors.antenna_left_m", "FORMAT.radio.freedom", "fixed_lag",
     ),
     "smoother": ("FORMAT.priors.core", "fixed_lag"),
     "fixed-lag": (),

@@ -524,6 +524,9 @@ class PriorsConfig(Model):
     rssi_exponent: NonNegative
     beacon_offset_m: NonNegative
     beacon_reference_db: NonNegative
+    beacon_height_m2: NonNegative
+    antenna_ahead_m: NonNegative
+    antenna_left_m: NonNegative
     pose_m: Positive
     heading_rad: Positive
     core: Annotated[float, Field(gt=0.0, le=1.0)]

@@ -102,6 +102,7 @@ def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) 
     run = RecordedRun(
         recording.name, recording.kind, steps, readings, beacon_ids, places_m, truth, first_pose, (),
         (ahead_m, left_m), known_map, tags, known.moving,
+        tuple(name for name, one_m in zip(beacon_ids, z_m.tolist(), strict=True) if np.isfinite(one_m)),
     )  # fmt: skip
     # A row with two readings gives the same warning of each.
     return replace(run, warnings=tuple(dict.fromkeys((*warnings, *suspicions(run)))))

@@ -7,9 +7,17 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.config.models import OdometryNoiseConfig, PriorsConfig, RecordingConfig
-from ccatp.beacons.estimation.measurement_models import bearing_row, level_row, range_row, range_variance
+from ccatp.beacons.estimation.measurement_models import ANTENNA, bearing_row, level_row, range_row, range_variance
 from ccatp.beacons.estimation.motion import POSE, resting, step_variances, turned_way
-from ccatp.beacons.estimation.recording import BeaconId, BoolArray, Readings, RecordedRun, Steps, running_total
+from ccatp.beacons.estimation.recording import (
+    BeaconId,
+    BoolArray,
+    Readings,
+    RecordedRun,
+    Steps,
+    antenna_path,
+    running_total,
+)
 from ccatp.core import FloatArray, IntArray
 from ccatp.filters.metrics import wrapped
 
@@ -133,11 +141,16 @@ class Reckoning:
         return total
 
 
-OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
+OF_READINGS = (
+    "range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent", *ANTENNA,
+)  # fmt: skip
 # Unknowns that are neither pose nor beacon, in the order of the state; all are zero for perfectly calibrated sensors.
 SHARED = (*CALIBRATION, *OF_READINGS)
-RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET, RSSI_REFERENCE, RSSI_EXPONENT = (SHARED.index(name) for name in OF_READINGS)
-BEACON = 4  # states of a beacon: x_m, y_m, offset of its ranges, m, and of its P_ref, dB
+RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET, RSSI_REFERENCE, RSSI_EXPONENT, *ARM = (
+    SHARED.index(name) for name in OF_READINGS
+)
+# States of a beacon: x_m, y_m, offset of its ranges, m, and of its P_ref, dB, its height over the antenna squared, m^2.
+BEACON, HEIGHT = 5, 4
 
 
 @dataclass(slots=True)
@@ -159,11 +172,11 @@ class BatchState:
     """Values of all unknowns."""
 
     poses: FloatArray  # x_m, y_m, heading_rad at each instant, shape (n, 3)
-    shared: FloatArray  # by ``SHARED``, shape (11,)
-    beacons: FloatArray  # x_m, y_m, range_offset_m, reference_db by beacon, shape (b, 4)
+    shared: FloatArray  # by ``SHARED``, shape (13,)
+    beacons: FloatArray  # x_m, y_m, range_offset_m, reference_db, height_m2 by beacon, shape (b, 5)
 
     def moved(self, poses: FloatArray, shared: FloatArray) -> "BatchState":
-        """The state after a step: ``poses`` (n, 3); ``shared`` with the beacons behind, shape (11 + 4 b,)."""
+        """The state after a step: ``poses`` (n, 3); ``shared`` with the beacons behind, shape (13 + 5 b,)."""
         split = len(SHARED)
         beacons = self.beacons + shared[split:].reshape(-1, BEACON)
         return BatchState(self.poses + poses, self.shared + shared[:split], beacons)
@@ -183,11 +196,11 @@ class MarginalPrior:
     """
 
     pose: FloatArray  # shape (3,)
-    shared: FloatArray  # by ``SHARED``, shape (11,)
-    beacons: FloatArray  # shape (b, 4)
+    shared: FloatArray  # by ``SHARED``, shape (13,)
+    beacons: FloatArray  # shape (b, 5)
     known: BoolArray  # beacons that it contains, shape (b,); the rows of others are zero
-    information: FloatArray  # L, of z: pose, shared, beacons, shape (14 + 4 b, 14 + 4 b)
-    side: FloatArray  # g, shape (14 + 4 b,)
+    information: FloatArray  # L, of z: pose, shared, beacons, shape (16 + 5 b, 16 + 5 b)
+    side: FloatArray  # g, shape (16 + 5 b,)
 
     @classmethod
     def made(
@@ -245,8 +258,8 @@ class BeaconNoise(NamedTuple):
 class PlacePrior(NamedTuple):
     """What is known of the places of beacons before the run: a Gaussian of the unknowns that are no poses."""
 
-    mean: FloatArray  # by ``SHARED`` and beacons, shape (11 + 4 b,)
-    information: FloatArray  # zero but for the places of known beacons, shape (11 + 4 b, 11 + 4 b)
+    mean: FloatArray  # by ``SHARED`` and beacons, shape (13 + 5 b,)
+    information: FloatArray  # zero but for the places of known beacons, shape (13 + 5 b, 13 + 5 b)
 
     @classmethod
     def of_run(cls, run: RecordedRun, names: Collection[BeaconId]) -> "PlacePrior":
@@ -272,7 +285,7 @@ class Residuals:
     by_steps: FloatArray  # of the odometry by first pose, second pose and ``CALIBRATION``, shape (n - 1, 3, 3 + 3 + 6)
     readings: FloatArray  # predicted minus measured, shape (m, 3)
     information: FloatArray  # of each, zero where there is no reading, shape (m, 3)
-    by_unknowns: FloatArray  # of the readings by the pose, ``OF_READINGS`` and the beacon, shape (m, 3, 3 + 5 + 4)
+    by_unknowns: FloatArray  # of the readings by the pose, ``OF_READINGS`` and the beacon, shape (m, 3, 3 + 7 + 5)
 
     @property
     def chi2(self) -> FloatArray:
@@ -286,13 +299,15 @@ class BatchProblem:
 
     ``times_s``: instants of the poses, beginning with the first odometry time, shape (n,). ``used``: mask of the
     beacons that are estimated, shape (b,); readings of others are ignored. ``marginal``: replaces the prior of the
-    first pose. ``noise``: of the ranges. ``places``: what is known of them before the run.
+    first pose. ``noise``: of the ranges. ``places``: what is known of them before the run. ``raised``: beacons whose
+    heights may be estimated, (b,); None: none.
     """
 
     def __init__(
         self, steps: Steps, readings: Readings, times_s: FloatArray, first_pose: tuple[float, float, float],
         settings: RecordingConfig, used: BoolArray, rest: tuple[float, float] = (0.0, 0.0),
         marginal: MarginalPrior | None = None, noise: BeaconNoise | None = None, places: PlacePrior | None = None,
+        raised: BoolArray | None = None,
     ) -> None:  # fmt: skip
         priors, self._places = settings.priors, places
         rest = rest if priors.turn_bias_rad_s > 0.0 else (0.0, 0.0)
@@ -311,7 +326,7 @@ class BatchProblem:
         # Readings whose errors last are counted less, but their outliers are recognized by their own noise.
         self.power = np.ones(len(readings.times_s)) if noise is None else 1.0 / noise.repeats[self.heard]
         self._range_factor = 1.0 if noise is None else noise.variance[self.heard]
-        self.free, self.prior_information = of_priors(priors, used)
+        self.free, self.prior_information = of_priors(priors, used, raised)
         self.marginal = marginal
         rest_s, rest_rad = self.reckoning.at_rest
         self.assumed_information = self.prior_information.copy()  # without what is measured at rest
@@ -418,7 +433,7 @@ class BatchProblem:
         return information[np.ix_(self.free, self.free)], pull[self.free]
 
     def spread(self, shared: FloatArray) -> FloatArray:
-        """A step of the free shared unknowns as a step of all, (11 + 4 b,), zero for the fixed ones."""
+        """A step of the free shared unknowns as a step of all, (13 + 5 b,), zero for the fixed ones."""
         whole = np.zeros(self.free.size)
         whole[self.free] = shared
         return whole
@@ -437,12 +452,14 @@ class BatchProblem:
         by_steps = np.concatenate([by_poses, -by_calibration], axis=2)
 
         pose, beacon = state.poses[self.at], state.beacons[self.readings.beacon]
-        at_m = self.readings.radios_at(pose)
+        shared, radio = state.shared, self.radio
+        arm_m = shared[ARM] + (0.0 if self.readings.arm_m is None else self.readings.arm_m)
+        at_m = antenna_path(pose, arm_m)
         dx, dy = beacon[:, 0] - at_m[:, 0], beacon[:, 1] - at_m[:, 1]
-        shared, radio, m = state.shared, self.radio, len(dx)
+        m = len(dx)
         reference_dbm = radio.rssi_reference_dbm + shared[RSSI_REFERENCE] + beacon[:, 3]
         exponent = radio.rssi_exponent + shared[RSSI_EXPONENT]
-        range_m, *by_range, r = range_row(np, dx, dy, 1.0 + shared[RANGE_SCALE])
+        range_m, *by_range, by_height, r = range_row(np, dx, dy, 1.0 + shared[RANGE_SCALE], beacon[:, HEIGHT])
         direction, *by_bearing = bearing_row(np, dx, dy)
         level_dbm, *by_level, by_exponent = level_row(np, dx, dy, reference_dbm, exponent)
         expected = (
@@ -454,12 +471,16 @@ class BatchProblem:
         by_beacon[:, :, :2] = np.array((by_range, by_bearing, by_level)).transpose(2, 0, 1)
         by_beacon[:, 0, 2] = by_beacon[:, 2, 3] = 1.0
         by_pose[:, :, :2], by_pose[:, 1, 2] = -by_beacon[:, :, :2], -1.0
-        if self.readings.arm_m is not None:  # the radio moves by (-y, x) of its lever arm when the vehicle turns
-            x_m, y_m = (at_m - pose[:, :2]).T
-            by_pose[:, :, 2] += by_beacon[:, :, 0] * y_m[:, None] - by_beacon[:, :, 1] * x_m[:, None]
+        by_beacon[:, 0, HEIGHT] = by_height
+        # The radio moves by (-y, x) of its lever arm when the vehicle turns.
+        x_m, y_m = (at_m - pose[:, :2]).T
+        by_pose[:, :, 2] += by_beacon[:, :, 0] * y_m[:, None] - by_beacon[:, :, 1] * x_m[:, None]
+        c, s = np.cos(pose[:, 2])[:, None], np.sin(pose[:, 2])[:, None]
         by_shared = np.zeros((m, 3, len(OF_READINGS)))
         by_shared[:, 0, 0], by_shared[:, 0, 1], by_shared[:, 1, 2] = r, 1.0, 1.0
         by_shared[:, 2, 3], by_shared[:, 2, 4] = 1.0, by_exponent
+        by_shared[:, :, 5] = -c * by_beacon[:, :, 0] - s * by_beacon[:, :, 1]
+        by_shared[:, :, 6] = s * by_beacon[:, :, 0] - c * by_beacon[:, :, 1]
         # By the measured range, not the predicted one: a variance that depends on the state would bias it outwards.
         variances = np.empty_like(errors)
         variances[:, 0] = range_variance(radio, self._read[:, 0]) * self._range_factor
@@ -483,13 +504,15 @@ def _banded(blocks: FloatArray, below: FloatArray) -> FloatArray:
     return band
 
 
-def of_priors(priors: PriorsConfig, used: BoolArray) -> tuple[BoolArray, FloatArray]:
-    """Which shared unknowns and states of the beacons are estimated, and the information of their priors, (11 + 4 b,).
+def of_priors(priors: PriorsConfig, used: BoolArray, raised: BoolArray | None) -> tuple[BoolArray, FloatArray]:
+    """Which shared unknowns and states of the beacons are estimated, and the information of their priors, (13 + 5 b,).
 
-    A standard deviation of 0 fixes an unknown; places have no prior.
+    A standard deviation of 0 fixes an unknown; places have no prior. ``raised``: as for ``BatchProblem``.
     """
     beacons = np.zeros((len(used), BEACON))
-    beacons[used] = (np.inf, np.inf, priors.beacon_offset_m, priors.beacon_reference_db)
+    beacons[used, :HEIGHT] = np.inf, np.inf, priors.beacon_offset_m, priors.beacon_reference_db
+    if raised is not None:
+        beacons[used & raised, HEIGHT] = priors.beacon_height_m2
     sigmas = np.concatenate([[getattr(priors, name) for name in SHARED], beacons.ravel()])
     free = sigmas > 0.0
     return free, np.where(free, 1.0 / np.where(free, sigmas, 1.0) ** 2, 0.0)

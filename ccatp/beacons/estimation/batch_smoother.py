@@ -5,7 +5,7 @@ of the filter.
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from ccatp.beacons.config.models import (
 )
 from ccatp.beacons.estimation.batch_problem import (
     BEACON,
+    HEIGHT,
     RSSI_REFERENCE,
     SHARED,
     BatchProblem,
@@ -31,6 +32,7 @@ from ccatp.beacons.estimation.causal import Followed, beyond_priors, follow
 from ccatp.beacons.estimation.evaluation import aligned_beacons
 from ccatp.beacons.estimation.landmark_init import LEAST
 from ccatp.beacons.estimation.least_squares import WELL_CONVERGED, Factored, descend, t_weights
+from ccatp.beacons.estimation.measurement_models import HEIGHT_M2
 from ccatp.beacons.estimation.odometry_noise import OdometryNoise, odometry_noise
 from ccatp.beacons.estimation.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun, Steps
 from ccatp.beacons.estimation.window import spread_by_priors
@@ -60,7 +62,7 @@ class Start(NamedTuple):
 def _started(run: RecordedRun, settings: RecordingConfig, found: Followed, times_s: FloatArray) -> Start:
     """Path, map and calibration of the filter; a beacon that still waits begins at its best candidate."""
     slam, poses = found.slam, _poses_at(found.path, times_s)
-    priors, shared = settings.priors, np.zeros(len(SHARED))
+    priors, shared, raised = settings.priors, np.zeros(len(SHARED)), run.raised
     for name, (value, _) in slam.calibration.items():
         shared[SHARED.index(name)] = value
     count = len(run.beacon_ids)
@@ -77,7 +79,9 @@ def _started(run: RecordedRun, settings: RecordingConfig, found: Followed, times
         if name in run.moving:
             continue
         beacons[k, :2], used[k] = mean[:2], True
-        if mean.size > 2 and priors.rssi_reference_db > 0.0:
+        if raised[k]:
+            beacons[k, HEIGHT] = mean[2] if mean.size > 2 else 0.0  # the filter alone has none
+        elif mean.size > 2 and priors.rssi_reference_db > 0.0:
             levels_db.append(mean[2] - settings.radio.rssi_reference_dbm)
     if levels_db:
         shared[RSSI_REFERENCE] = np.mean(levels_db)
@@ -159,7 +163,8 @@ def smooth(
 
     def problem_of(settings: RecordingConfig) -> BatchProblem:
         return BatchProblem(
-            run.steps, readings, times_s, run.first_pose, settings, start.used, rest, noise=found.noise, places=places
+            run.steps, readings, times_s, run.first_pose, settings, start.used, rest, noise=found.noise, places=places,
+            raised=run.raised,
         )  # fmt: skip
 
     fit = _fitted(problem_of, start.state, found, settings.odometry)
@@ -178,8 +183,8 @@ def smooth(
         x_m, y_m = state.beacons[k, :2].tolist()
         beacons[run.beacon_ids[k]] = BeaconFix(x_m, y_m, covariance[place, place])
         of_map += range(place.start, place.stop)
-    calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)))
-    priors = {name: getattr(problem.priors, name) for name in SHARED}
+    calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)), run.beacon_ids)
+    priors = {name: getattr(problem.priors, name) for name in (*SHARED, HEIGHT_M2)}
     warnings = [*_warnings(run, start, fit.converged), *beyond_priors(calibration, priors, run.kind)]
     for what, name in (("range", "range_sigma_m"), ("bearing", "bearing_sigma_rad"), ("rssi", "rssi_sigma_db")):
         if (ratio := getattr(problem.radio, name) / getattr(settings.radio, name)) > NOISY:
@@ -250,7 +255,9 @@ def _widened(problem: BatchProblem, state: BatchState) -> RadioNoiseConfig:
     return radio.model_copy(update=wider)
 
 
-def _calibration(problem: BatchProblem, state: BatchState, sigmas: FloatArray) -> dict[str, Calibrated]:
+def _calibration(
+    problem: BatchProblem, state: BatchState, sigmas: FloatArray, names: Sequence[str]
+) -> dict[str, Calibrated]:
     has_ranges, has_bearings, has_levels = (bool(problem.there[:, k].any()) for k in range(3))
     shown = {"range_scale": has_ranges, "range_offset_m": has_ranges, "bearing_offset_rad": has_bearings}
     shown |= {"rssi_reference_db": has_levels, "rssi_exponent": has_levels}
@@ -258,6 +265,9 @@ def _calibration(problem: BatchProblem, state: BatchState, sigmas: FloatArray) -
     for k, name in enumerate(SHARED):
         if problem.free[k] and shown.get(name, True):
             found[name] = Calibrated(float(state.shared[k]), float(sigmas[k]))
+    for k, name in enumerate(names):
+        if problem.free[at := len(SHARED) + BEACON * k + HEIGHT]:
+            found[f"{HEIGHT_M2} {name}"] = Calibrated(float(state.beacons[k, HEIGHT]), float(sigmas[at]))
     return found
 
 

@@ -1,9 +1,11 @@
 """EKF-SLAM: estimates the pose of a vehicle and a map of the beacons from odometry and readings."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import partial
 from math import inf, log, sqrt
+from types import MappingProxyType
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -33,6 +35,8 @@ from ccatp.beacons.estimation.landmark_init import (
     StackedRows,
 )
 from ccatp.beacons.estimation.measurement_models import (
+    ANTENNA,
+    HEIGHT_M2,
     MeasurementModels,
     MeasurementRows,
     is_direction,
@@ -57,6 +61,7 @@ from ccatp.core import FloatArray
 from ccatp.kinematics import wrap_pi
 
 DELAY = "odometry_delay_s"
+NOTHING: Mapping[Any, float] = MappingProxyType({})
 UNITS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -84,6 +89,8 @@ class BeaconSlam:
         delay_sigma_s: prior standard deviation of the vehicle's delay behind its odometry; 0: it is not estimated.
         correlation_s: correlation time of the errors of a beacon's readings; 0: they are independent.
         iterations: linearisations of each update; one is enough if bearings are exact.
+        antenna_sigmas_m: prior standard deviations of the place of the antenna, by ``ANTENNA``; 0: not estimated.
+        height_sigmas_m2: those of the squares of the heights of beacons over the antenna; others are at its height.
 
     Attributes:
         engine: the state: vehicle | calibration | beacons, wandering errors and poses whose readings wait.
@@ -102,20 +109,24 @@ class BeaconSlam:
     def __init__(
         self, motion: DifferentialDrive | SlippingVehicle, models: MeasurementModels, how: SlamFilterConfig,
         pose0: VehiclePose | Sequence[float], P0: FloatArray, *, gate: float, delay_sigma_s: float = 0.0,
-        correlation_s: float = 0.0, iterations: int = 1,
+        correlation_s: float = 0.0, iterations: int = 1, antenna_sigmas_m: Mapping[str, float] = NOTHING,
+        height_sigmas_m2: Mapping[BeaconId, float] = NOTHING,
     ) -> None:  # fmt: skip
         self._motion, self._models, self._how = motion, models, how
         delay_names, delay_sigmas = estimated({DELAY: delay_sigma_s})
-        own, shared = motion.prior_sigmas, (*models.prior_sigmas, *delay_sigmas)
+        antenna_names, antenna_sigmas = estimated(antenna_sigmas_m)
+        own, shared = motion.prior_sigmas, (*models.prior_sigmas, *delay_sigmas, *antenna_sigmas)
         v, self._ranges = POSE + len(own), len(models.names)
         mean, P = np.zeros(v), np.zeros((v, v))
         mean[:POSE], P[:POSE, :POSE] = pose0, P0
         P[range(POSE, v), range(POSE, v)] = np.square(own)
         self.engine = EkfSlam(mean, P, np.zeros(len(shared)), np.diag(np.square(shared)))
         self._shared = slice(v, v + len(shared))
-        self._delay = v + len(shared) - 1 if delay_names else -1
+        self._delay = v + len(models.names) if delay_names else -1
+        self._of_place = slice(v + len(models.names), v + len(shared))  # on what the place of a reading depends, too
+        self._axes, self._raised = tuple(map(ANTENNA.index, antenna_names)), dict(height_sigmas_m2)
         self._shown = POSE + len(shared)  # columns of a row before the beacon: pose, delay, calibration of the readings
-        self._names = (*motion.names, *models.names, *delay_names)
+        self._names = (*motion.names, *models.names, *delay_names, *antenna_names)
         self._wander = None
         if correlation_s > 0.0:
             self._wander = GaussMarkovBias(how.wander_share, how.wander_length_m, correlation_s)
@@ -156,10 +167,11 @@ class BeaconSlam:
         ``excess``: assumed and actual prior variance of calibrations by name: see ``Factored.spread_by``.
         """
         P = self.engine.covariance[columns][:, columns].copy()
-        for i, name in enumerate(self._names):
+        heights = [(self.place(b).stop - 1, HEIGHT_M2) for b in self._map if b in self._raised]
+        for i, name in (*enumerate(self._names, POSE), *heights):
             assumed, actual = excess.get(name, (1.0, 0.0))
             if actual > assumed:
-                by_mean = self.engine.covariance[columns, POSE + i] / assumed
+                by_mean = self.engine.covariance[columns, i] / assumed
                 P += (actual - assumed) * np.outer(by_mean, by_mean)
         return P
 
@@ -174,6 +186,13 @@ class BeaconSlam:
         """Mean and standard deviation of each estimated calibration parameter, by name."""
         mean, variances = self.engine.mean.tolist(), self.engine.covariance.diagonal().tolist()
         return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._names)}
+
+    @property
+    def heights(self) -> dict[str, tuple[float, float]]:
+        """The same of the square of the height of each beacon on the map, if it is estimated."""
+        found = {b: self.place(b).stop - 1 for b in self._map if b in self._raised}
+        mean, P = self.engine.mean, self.engine.covariance
+        return {f"{HEIGHT_M2} {b}": (float(mean[at]), sqrt(P[at, at])) for b, at in found.items()}
 
     def predict(self, odometry: Odometry) -> None:
         """Predict the vehicle over the odometry that is due."""
@@ -247,12 +266,16 @@ class BeaconSlam:
     def know(self, known: KnownMap, kinds: Mapping[BeaconId, str]) -> None:
         """Put beacons on the map before any reading. ``kinds``: of the readings of each, as in the models."""
         for name, place_m in zip(known.names, known.places_m, strict=True):
-            extra = self._models.by_kind[kinds[name]].extra_prior
+            extra = self._extra_prior(name, kinds[name])
             means, sigmas = zip((place_m[0], 1.0), (place_m[1], 1.0), *extra, strict=True)
             self._map.join(name, np.array(means), np.diag(np.square(sigmas)))
         starts = [self.engine.block(name).start for name in known.names]
         columns = columns_of(*((start, start + 1) for start in starts))
         self.engine.replace(columns, known.places_m.ravel(), known.covariance_m2)
+
+    def _extra_prior(self, beacon: BeaconId, kind: str) -> tuple[tuple[float, float], ...]:
+        height = ((0.0, self._raised[beacon]),) if beacon in self._raised else ()
+        return (*height, *self._models.by_kind[kind].extra_prior)
 
     def likely(self) -> dict[BeaconId, FloatArray]:
         """Places x_m, y_m of waiting beacons that have one likely place, though readings bend over its width."""
@@ -287,8 +310,12 @@ class BeaconSlam:
 
     def _columns(self, names: Sequence[str], beacons: Sequence[BeaconId]) -> Columns:
         calibration = [POSE + self._names.index(name) for name in names]
-        starts = [self.engine.block(beacon).start for beacon in beacons]
-        return columns_of(range(POSE), calibration, *((start, start + 1) for start in starts))
+        return columns_of(range(POSE), calibration, *map(self.place, beacons))
+
+    def place(self, beacon: BeaconId) -> slice:
+        """Columns of a beacon's place, and of the square of its height if that is estimated."""
+        start = self.engine.block(beacon).start
+        return slice(start, start + PLACE + (beacon in self._raised))
 
     def remove(self, beacon: BeaconId) -> None:
         """Remove a beacon; its next reading initialises it again. Raises BlockError: there was no reading of it."""
@@ -306,7 +333,7 @@ class BeaconSlam:
         kind, z = scalars_of(reading)[-1]
         model = self._models.by_kind[kind]
         reach_m, at = model.distance_m(z, name), self._at(reading.time_s)
-        there = RadioPose.at(at.pose, reading.radio)
+        there = self._radio_at(at.pose, reading.radio, self.engine.mean[self._of_place].tolist())
         waiting = self.waiting.setdefault(name, PendingLandmark(name))
         record = ReadingRecord(reading, ("place", name, waiting.count), reach_m)
         if reading.bearing_rad is not None:
@@ -332,7 +359,8 @@ class BeaconSlam:
 
     def _prior_at(self, waiting: PendingLandmark, x_m: float, y_m: float) -> BeaconEstimate:
         last = waiting.records[-1]
-        extra, sigma_m = self._models.by_kind[scalars_of(last.reading)[-1][0]].extra_prior, self.flat * last.distance_m
+        extra = self._extra_prior(waiting.beacon, scalars_of(last.reading)[-1][0])
+        sigma_m = self.flat * last.distance_m
         means, sigmas = zip((x_m, sigma_m), (y_m, sigma_m), *extra, strict=True)
         return BeaconEstimate(np.array(means), np.diag(np.square(sigmas)))
 
@@ -341,9 +369,8 @@ class BeaconSlam:
 
     def _clone(self, at: CarriedOdometry, there: RadioPose, size: int) -> tuple[FloatArray, Columns, FloatArray]:
         """Copy of a radio's pose or place, (size,); the columns it depends on; its derivatives by these, (size, k)."""
-        is_delayed = self._delay >= 0
-        J = [at.derivatives(*there.turned(*unit), delayed=is_delayed) for unit in UNITS[:size]]
-        columns = columns_of(range(POSE), (self._delay,) if is_delayed else ())
+        J = [self._by_place(at, there, unit) for unit in UNITS[:size]]
+        columns = columns_of(range(POSE), self._of_place)
         return np.array(there.pose[:size]), columns, np.array(J)
 
     def _stacked(self, waiting: PendingLandmark) -> StackedRows:
@@ -427,9 +454,9 @@ class BeaconSlam:
         is_delayed, shown = self._delay >= 0, self._shown
         at = self._clock.at(x, reading.time_s, x[POSE] if is_delayed else 0.0)
         calibration, beacon = x[shown - self._ranges : shown], x[shown : shown + size]
-        there = RadioPose.at(at.pose, reading.radio)
+        there = self._radio_at(at.pose, reading.radio, x[POSE : shown - self._ranges])
         row = self._models.by_kind[kind].row(there.pose, calibration, beacon, reading.beacon)
-        h = [*at.derivatives(*there.turned(*row.pose), delayed=is_delayed), *row.calibration, *row.beacon]
+        h = [*self._by_place(at, there, row.pose), *row.calibration, *row.beacon]
         expected = row.expected
         is_learned = heard.noise is not None and kind == "range"
         bias = heard.noise.bias if heard.noise is not None and is_learned else self._wander
@@ -444,6 +471,19 @@ class BeaconSlam:
             own = r + heard.fresh * by_wander * by_wander
         residual = wrap_pi(z - expected) if kind == "bearing" else z - expected
         return h, residual, r, own
+
+    def _radio_at(self, pose: list[float], radio: Radio | None, values: list[float]) -> RadioPose:
+        """A radio on the vehicle at a pose. ``values``: of the states of ``_of_place``."""
+        if not self._axes:
+            return RadioPose.at(pose, radio)
+        found = dict(zip(self._axes, values[-len(self._axes) :], strict=True))
+        return RadioPose.at(pose, radio, (found.get(0, 0.0), found.get(1, 0.0)))
+
+    def _by_place(self, at: CarriedOdometry, there: RadioPose, by: tuple[float, float, float]) -> list[float]:
+        """Derivatives by the pose and the states of ``_of_place``, from those by x, y and heading of the radio."""
+        by_antenna = there.by_place(*by[:2]) if self._axes else ()
+        own = at.derivatives(*there.turned(*by), delayed=self._delay >= 0)
+        return own + [by_antenna[axis] for axis in self._axes]
 
     def _judge(self, reading: Reading, entry: MapEntry, *, accepted: bool) -> None:
         if accepted:
@@ -470,10 +510,16 @@ class BeaconSlam:
 
 
 def recorded_slam(
-    cfg: RecordingConfig, how: SlamFilterConfig, pose0: VehiclePose | Sequence[float], P0: FloatArray
-) -> BeaconSlam:
-    """The filter for recorded runs."""
+    cfg: RecordingConfig, how: SlamFilterConfig, pose0: VehiclePose | Sequence[float], P0: FloatArray,
+    raised: Collection[BeaconId] | None = None,
+) -> BeaconSlam:  # fmt: skip
+    """The filter for recorded runs.
+
+    ``raised``: beacons whose heights are estimated, and with them the place of the antenna; None: neither is.
+    """
+    antenna = {} if raised is None else {name: getattr(cfg.priors, name) for name in ANTENNA}
     return BeaconSlam(
         DifferentialDrive(cfg.odometry, cfg.priors, how), recorded_models(cfg.radio, cfg.priors), how, pose0, P0,
         gate=cfg.radio.gate_sigmas**2, delay_sigma_s=cfg.priors.odometry_delay_s, correlation_s=cfg.radio.correlation_s,
+        antenna_sigmas_m=antenna, height_sigmas_m2=dict.fromkeys(raised or (), cfg.priors.beacon_height_m2),
     )  # fmt: skip

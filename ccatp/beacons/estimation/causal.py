@@ -13,6 +13,7 @@ from ccatp.beacons.config.models import FixedLagConfig, PriorsConfig, RecordingC
 from ccatp.beacons.estimation.batch_problem import BeaconNoise
 from ccatp.beacons.estimation.beacon_map import HEADING
 from ccatp.beacons.estimation.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
+from ccatp.beacons.estimation.measurement_models import ANTENNA
 from ccatp.beacons.estimation.motion import POSE, Increment
 from ccatp.beacons.estimation.odometry_noise import OdometryNoise
 from ccatp.beacons.estimation.recording import (
@@ -37,11 +38,12 @@ UNCHANGED = 0.999  # share of the prior's standard deviation above which a value
 def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, float], kind: str) -> Iterator[str]:
     """A warning for each value that is more than FAR standard deviations from zero, the mean of its prior."""
     for name, (value, _) in calibration.items():
-        sigma = priors[name]
+        key = name.split()[0]  # the name of a beacon follows
+        sigma = priors[key]
         if abs(value) > FAR * sigma:
             yield (
                 f"{name} comes out as {value:+.3g}, {abs(value) / sigma:.1f} standard deviations of its prior: "
-                f"if that can be, widen {kind}.priors.{name} (now {sigma:g})"
+                f"if that can be, widen {kind}.priors.{key} (now {sigma:g})"
             )
 
 
@@ -145,10 +147,13 @@ def follow(
 
     ``finest_s``: steps of odometry within an interval of this length are combined, but cut at each reading.
     """
+    if not np.isfinite(run.readings.range_m).any():  # levels are too coarse to tell the place of the antenna
+        cfg = cfg.model_copy(update={"priors": cfg.priors.model_copy(update=dict.fromkeys(ANTENNA, 0.0))})
     sigmas = cfg.priors.pose_m, cfg.priors.pose_m, cfg.priors.heading_rad
     window = None if lag is None else Window(run, cfg, how, lag)
     assumed = cfg if window is None else window.settings
-    search = HeadingRelocalizer(recorded_slam(assumed, how, run.first_pose, np.diag(np.square(sigmas))))
+    raised = None if window is None else window.raised
+    search = HeadingRelocalizer(recorded_slam(assumed, how, run.first_pose, np.diag(np.square(sigmas)), raised))
     if run.known_map is not None:
         search.best.know(run.known_map, _kinds(run))
     search.best.walks_m2_s = dict.fromkeys(run.moving, how.beacon_walk_m_sqrt_s**2)
@@ -226,8 +231,8 @@ def _result(
     # Only values that the readings have determined at least in part.
     calibration = {
         name: Calibrated(*found)
-        for name, found in slam.calibration.items()
-        if found[1] < UNCHANGED * getattr(assumed, name)
+        for name, found in (slam.calibration | slam.heights).items()
+        if found[1] < UNCHANGED * getattr(assumed, name.split()[0])
     }
     beacons, none = [(name, fix) for name, fix in slam.beacons.items() if name not in slam.walks_m2_s], np.empty(0)
     for name, until_s, fix in slam.left:

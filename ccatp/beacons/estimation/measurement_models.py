@@ -20,14 +20,25 @@ from ccatp.beacons.estimation.path_loss import PathLoss
 from ccatp.beacons.estimation.recording import BeaconId, Reading
 from ccatp.core import FloatArray
 
+ANTENNA, HEIGHT_M2 = ("antenna_ahead_m", "antenna_left_m"), "beacon_height_m2"  # calibration of the installation
 DB = 10.0 / math.log(10.0)
+RAISED = 3  # states of a beacon placed by ranges, with the square of its height
+LOWEST = 0.25  # smallest share of the squared distance in the plane that a negative square of a height leaves
 NEAREST_M2 = 1e-6  # added to squared distances: at a beacon a range has no direction
 
 
-def range_row(xp: ModuleType, dx: Any, dy: Any, scale: Any) -> tuple[Any, Any, Any, Any]:
-    """(1 + e) r of the vector (dx, dy) to a beacon, its derivatives by dx, dy and e; ``scale`` is 1 + e."""
-    r = xp.sqrt(dx * dx + dy * dy + NEAREST_M2)
-    return scale * r, scale * dx / r, scale * dy / r, r
+def range_row(xp: ModuleType, dx: Any, dy: Any, scale: Any, height_m2: Any = 0.0) -> tuple[Any, Any, Any, Any, Any]:
+    """(1 + e) r to a beacon, r^2 = dx^2 + dy^2 + v, and its derivatives by dx, dy, v and e.
+
+    ``scale``: 1 + e. ``height_m2``: v, the square of the beacon's height over the antenna. Errors may make its estimate
+    negative: r is at least half the distance in the plane.
+    """
+    flat = dx * dx + dy * dy + NEAREST_M2
+    square, least = flat + height_m2, LOWEST * flat
+    is_least = 1.0 * (square < least)
+    r = xp.sqrt(square + is_least * (least - square))
+    along = scale * (1.0 - (1.0 - LOWEST) * is_least)
+    return scale * r, along * dx / r, along * dy / r, 0.5 * scale / r * (1.0 - is_least), r
 
 
 def bearing_row(xp: ModuleType, dx: Any, dy: Any) -> tuple[Any, Any, Any]:
@@ -90,7 +101,10 @@ class MeasurementModel(ABC):
 
 
 class RangeModel(MeasurementModel):
-    """z = (1 + e) r + o, with scale e and offset o shared by all beacons, each estimated if its prior is not zero."""
+    """z = (1 + e) r + o, with scale e and offset o shared by all beacons, each estimated if its prior is not zero.
+
+    A third state of a beacon is the square of its height over the antenna.
+    """
 
     def __init__(self, radio: RadioNoiseConfig, priors: PriorsConfig) -> None:
         self._radio = radio
@@ -100,18 +114,23 @@ class RangeModel(MeasurementModel):
 
     def row(self, pose: list[float], calibration: list[float], beacon: list[float], name: BeaconId) -> MeasurementRow:
         """The range."""
+        x_m, y_m, *height_m2 = beacon[: RAISED if len(beacon) == RAISED else 2]
         scale, offset = self._calibrated(calibration)
-        expected, ux, uy, r = range_row(math, beacon[0] - pose[0], beacon[1] - pose[1], scale)
+        expected, ux, uy, by_height, r = range_row(math, x_m - pose[0], y_m - pose[1], scale, *height_m2)
         by = (r,) * self._has_scale + (1.0,) * self._has_offset
-        return MeasurementRow(expected + offset, (-ux, -uy, 0.0), by, (ux, uy), range_variance(self._radio, r))
+        by_beacon = (ux, uy, *(by_height,) * len(height_m2))
+        return MeasurementRow(expected + offset, (-ux, -uy, 0.0), by, by_beacon, range_variance(self._radio, r))
 
     def rows(self, poses: FloatArray, calibration: list[float], beacons: FloatArray, name: BeaconId) -> MeasurementRows:
         """The ranges, all at once. Roots and the four operations give the same bits in NumPy as in ``math``."""
         scale, offset = self._calibrated(calibration)
-        expected, ux, uy, r = range_row(np, beacons[:, 0] - poses[:, 0], beacons[:, 1] - poses[:, 1], scale)
-        towards, by_pose = np.empty((r.size, 2)), np.zeros((r.size, 3))
-        towards[:, 0], towards[:, 1] = ux, uy
-        by_pose[:, :2] = -towards
+        states = RAISED if beacons.shape[1] == RAISED else 2
+        x_m, y_m, *height_m2 = beacons.T[:states]
+        expected, *by_beacon, r = range_row(np, x_m - poses[:, 0], y_m - poses[:, 1], scale, *height_m2)
+        towards, by_pose = np.empty((r.size, states)), np.zeros((r.size, 3))
+        for state, slope in enumerate(by_beacon[:states]):
+            towards[:, state] = slope
+        by_pose[:, :2] = -towards[:, :2]
         by = np.ones((r.size, self._has_scale + self._has_offset))
         if self._has_scale:
             by[:, 0] = r

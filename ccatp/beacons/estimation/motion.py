@@ -320,15 +320,24 @@ class RadioPose(NamedTuple):
 
     pose: list[float]  # x_m, y_m of the radio, heading_rad
     by_heading: tuple[float, float]  # derivatives of its x_m and y_m by the heading
+    ahead: tuple[float, float] = (1.0, 0.0)  # direction of the heading
 
     @classmethod
-    def at(cls, pose: list[float], radio: Radio | None) -> "RadioPose":
-        """Of a vehicle at a pose. ``radio``: None: it is at the pose."""
-        if radio is None:
+    def at(cls, pose: list[float], radio: Radio | None, off_m: tuple[float, float] | None = None) -> "RadioPose":
+        """Of a vehicle at a pose. ``radio``: None: it is at the pose. ``off_m``: from there, ahead and left."""
+        if radio is None and off_m is None:
             return cls(pose, (0.0, 0.0))
+        ahead_m, left_m = off_m or (0.0, 0.0)
+        if radio is not None:
+            ahead_m, left_m = ahead_m + radio.ahead_m, left_m + radio.left_m
         c, s = cos(pose[2]), sin(pose[2])
-        x, y = c * radio.ahead_m - s * radio.left_m, s * radio.ahead_m + c * radio.left_m
-        return cls([pose[0] + x, pose[1] + y, pose[2]], (-y, x))
+        x, y = c * ahead_m - s * left_m, s * ahead_m + c * left_m
+        return cls([pose[0] + x, pose[1] + y, pose[2]], (-y, x), (c, s))
+
+    def by_place(self, hx: float, hy: float) -> tuple[float, float]:
+        """Derivatives by the place of the radio ahead and left, from those by its x and y."""
+        c, s = self.ahead
+        return hx * c + hy * s, hy * c - hx * s
 
     def turned(self, hx: float, hy: float, turned: float) -> tuple[float, float, float]:
         """Derivatives by the vehicle's x, y and heading, from those by the radio's."""

@@ -7,11 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.estimation.range_noise import FEWEST, correlations
-from ccatp.beacons.estimation.recording import Calibrated, EstimatedPath, Readings, RecordedRun, dead_reckoned
+from ccatp.beacons.estimation.recording import EstimatedPath, Readings, RecordedRun, dead_reckoned
 from ccatp.beacons.rigid_motion import best_motion
 from ccatp.core import FloatArray
 
-_NONE = Calibrated(0.0, 0.0)
 _MOST = 0.999
 _NEAR_M, _FLAT = 1e-3, 1e-6
 _CLIPPED = 3.0  # medians at which errors are cut off: a few outliers must not decide
@@ -44,9 +43,7 @@ def predicted(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -
     used = np.isfinite(r.range_m) & (r.times_s >= begin_s[r.beacon]) & (r.times_s > track.times_s[0])
     if used.sum() < FEWEST:
         return None
-    r = r.where(used)
-    scale, offset_m = (track.calibration.get(name, _NONE).value for name in ("range_scale", "range_offset_m"))
-    r = r._replace(range_m=(r.range_m - offset_m) / (1.0 + scale))
+    r = track.calibrated(r.where(used), names)
     places = np.array([track.beacons[name][:2] if name in track.beacons else (np.nan, np.nan) for name in names])
     reckoned = dead_reckoned(run.steps, run.first_pose)
     own_m, reckoned_m = (_errors(r, at, places) for at in _ahead(run, track, reckoned, r, 0.0))

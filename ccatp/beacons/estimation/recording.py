@@ -140,6 +140,14 @@ class RecordedRun:
     tags: tuple[Radio, ...] = ()  # the vehicle's radios, if the readings are of several: poses are the origin's then
 
     moving: tuple[str, ...] = ()  # of ``beacon_ids``: those that move
+    levelled: tuple[str, ...] = ()  # those of known height: their ranges are in the plane of the antenna
+
+    @property
+    def raised(self) -> BoolArray:
+        """Whether the height of a beacon over the antenna may be told by its ranges, shape (b,)."""
+        r, found = self.readings, np.array([name not in self.levelled for name in self.beacon_ids], dtype=bool)
+        found[r.beacon[np.isnan(r.range_m) & np.isfinite(r.rssi_dbm)]] = False  # placed by levels
+        return found
 
     @property
     def radios(self) -> Sequence[Radio | None]:
@@ -246,6 +254,17 @@ class EstimatedPath(NamedTuple):
     innovations: tuple[ReadingInnovation, ...] = ()  # of all readings of beacons on the map; empty from a smoother
     # Of beacons that move, which are not in ``beacons``, and of those placed again: where each was until then.
     tracks: Mapping[str, BeaconTrack] = MappingProxyType({})
+
+    def calibrated(self, r: Readings, beacon_ids: Sequence[str]) -> Readings:
+        """Readings of beacons by ``beacon_ids``, with calibrated ranges in the plane, from where the antenna is."""
+        value = {name: one.value for name, one in self.calibration.items()}
+        range_m = (r.range_m - value.get("range_offset_m", 0.0)) / (1.0 + value.get("range_scale", 0.0))
+        heights_m2 = np.array([value.get(f"beacon_height_m2 {name}", 0.0) for name in beacon_ids])[r.beacon]
+        flat_m = np.sqrt(np.maximum(range_m**2 - heights_m2, 0.0))
+        arm_m = np.array((value.get("antenna_ahead_m", 0.0), value.get("antenna_left_m", 0.0)))
+        if arm_m.any():
+            r = r._replace(arm_m=np.broadcast_to(arm_m, (len(range_m), 2)) + (0.0 if r.arm_m is None else r.arm_m))
+        return r._replace(range_m=np.where(heights_m2 == 0.0, range_m, flat_m))
 
     def poses_at(self, at_s: FloatArray) -> FloatArray:
         """Poses at other times, shape (m, 3), linear between two of its own."""

@@ -8,22 +8,20 @@ import numpy as np
 from ccatp.beacons.config.models import RadioNoiseConfig
 from ccatp.beacons.estimation.measurement_models import range_variance
 from ccatp.beacons.estimation.predictions import predicted, prediction_lines
-from ccatp.beacons.estimation.recording import Calibrated, EstimatedPath, RecordedRun, antenna_path
+from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, antenna_path
 from ccatp.beacons.rigid_motion import rigid_modes
 from ccatp.core import FloatArray
 
 _PLACES = 200  # number of places along the path at which a next reading is considered
-_NONE = Calibrated(0.0, 0.0)
 
 
 def range_residuals(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -> FloatArray:
     """Calibrated ranges minus those of path and map, m, shape (m,); NaN without a range or a beacon on the map."""
     nowhere = np.full(2, np.nan)
     places = np.array([track.beacons[name][:2] if name in track.beacons else nowhere for name in run.beacon_ids])
-    r = run.readings.with_distances(camera_field_rad)
+    r = track.calibrated(run.readings.with_distances(camera_field_rad), run.beacon_ids)
     at = r.radios_at(track.poses_at(r.times_s))
-    scale, offset_m = (track.calibration.get(name, _NONE).value for name in ("range_scale", "range_offset_m"))
-    return np.asarray((r.range_m - offset_m) / (1.0 + scale) - np.hypot(*(places[r.beacon] - at).T))
+    return np.asarray(r.range_m - np.hypot(*(places[r.beacon] - at).T))
 
 
 def residuals_by_beacon(run: RecordedRun, residuals_m: FloatArray) -> dict[str, dict[str, float]]:

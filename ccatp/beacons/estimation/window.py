@@ -18,6 +18,7 @@ from ccatp.beacons.config.models import FixedLagConfig, PriorsConfig, RecordingC
 from ccatp.beacons.estimation.batch_problem import (
     BEACON,
     CALIBRATION,
+    HEIGHT,
     SHARED,
     BatchProblem,
     BatchState,
@@ -28,6 +29,7 @@ from ccatp.beacons.estimation.batch_problem import (
 )
 from ccatp.beacons.estimation.beacon_slam import BeaconSlam
 from ccatp.beacons.estimation.least_squares import Factored, descend, eliminated, t_weights
+from ccatp.beacons.estimation.measurement_models import ANTENNA, HEIGHT_M2
 from ccatp.beacons.estimation.motion import POSE
 from ccatp.beacons.estimation.odometry_noise import OdometryNoise, odometry_noise
 from ccatp.beacons.estimation.range_noise import range_noise
@@ -44,15 +46,18 @@ REPORTED = 3.0  # readings that count as one, above which that is reported
 EARLIER_S = 2.0  # of odometry before the window, for its delay
 
 
+SETTLED = 50  # iterations: the variance falls by a factor of FREEDOM + 1 in one where readings tell nothing
 FREEDOM = 8.0  # of Student's t of a calibration: one of several cores costs less than a Gaussian would take
 # Standard deviation of a calibration among instruments, as a share of the prior, which is that of the worst ones.
 # Covariances are those of errors with this spread, though the estimate assumes the core, which is narrower.
 USUAL = 0.5
 # Levels are left out: the spread of transmitters is no fault of an instrument.
-INSTRUMENTAL = (*CALIBRATION, "range_scale", "range_offset_m", "bearing_offset_rad")
+INSTRUMENTAL = (
+    *CALIBRATION, "range_scale", "range_offset_m", "bearing_offset_rad", *ANTENNA, HEIGHT_M2,
+)  # fmt: skip
 
 
-def reweighted(priors: PriorsConfig, squares: Mapping[str, float]) -> PriorsConfig:
+def reweighted(priors: PriorsConfig, squares: Mapping[str, Sequence[float]]) -> PriorsConfig:
     """Gaussian priors with the weight that Student's t has at calibrations of these expected squares.
 
     The scale of t is ``core`` times the standard deviation of the prior. The variance is (freedom scale^2 + square) /
@@ -62,7 +67,8 @@ def reweighted(priors: PriorsConfig, squares: Mapping[str, float]) -> PriorsConf
     for name in INSTRUMENTAL:
         scale = priors.core * float(getattr(priors, name))
         if scale > 0.0:
-            sigmas[name] = sqrt((FREEDOM * scale**2 + squares.get(name, scale**2)) / (FREEDOM + 1.0))
+            found = squares.get(name, (scale**2,))
+            sigmas[name] = sqrt((FREEDOM * scale**2 + sum(found)) / (FREEDOM + len(found)))
     return priors.model_copy(update=sigmas)
 
 
@@ -75,7 +81,10 @@ def spread_by_priors(factored: Factored, problem: BatchProblem, configured: Prio
     """The factors with the covariances of errors among instruments."""
     variances = np.full((2, problem.free.size), np.inf)
     for name, found in excesses(problem.priors, configured).items():
-        variances[:, SHARED.index(name)] = found
+        if name in SHARED:
+            variances[:, SHARED.index(name)] = found
+        else:
+            variances[:, len(SHARED) + HEIGHT :: BEACON] = np.array(found)[:, None]
     return factored.spread_by(*variances[:, problem.free])
 
 
@@ -84,6 +93,22 @@ class _Solved(NamedTuple):
     state: BatchState
     factored: Factored
     times_s: FloatArray
+
+
+def settled_square(value: float, variance: float, assumed: float, scale: float) -> float:
+    """Expected square of a calibration when it and the weight of its prior have converged, from a flat prior on.
+
+    ``value``, ``variance``: its estimate under a Gaussian prior with the standard deviation ``assumed``. ``scale``:
+    that of Student's t. If the readings alone tell x with the information J, the estimate under a prior of variance w
+    is P J x, P = 1 / (J + 1 / w). From the core on, with one weight a solution, many solutions would be needed for a
+    value of many cores: an antenna that is elsewhere would be found metres later.
+    """
+    information, pull = max(1.0 / variance - assumed**-2, 1e-9), value / variance
+    P = 1.0 / information
+    for _ in range(SETTLED):
+        w = (FREEDOM * scale**2 + (P * pull) ** 2 + P) / (FREEDOM + 1.0)
+        P = 1.0 / (information + 1.0 / w)
+    return (P * pull) ** 2 + P
 
 
 class Window:
@@ -107,6 +132,8 @@ class Window:
         self._last: _Solved | None = None
         self._seen: tuple[object, ...] = (0, 0)
         self.noise = BeaconNoise.configured(len(run.beacon_ids) * len(run.radios))
+        self._raised = run.raised if cfg.priors.beacon_height_m2 > 0.0 else np.zeros(len(run.beacon_ids), dtype=bool)
+        self.raised = [name for name, is_raised in zip(run.beacon_ids, self._raised, strict=True) if is_raised]
         self._places = None if run.known_map is None else PlacePrior.of_run(run, run.beacon_ids)
         self._configured, self._cfg = cfg, cfg.model_copy(update={"priors": reweighted(cfg.priors, {})})
         self.odometry = self._odometry_before = OdometryNoise()
@@ -191,6 +218,10 @@ class Window:
                 "of its readings count as one"
             )
 
+    def _of_filter(self, k: int) -> tuple[int, ...]:
+        """States of a beacon that the filter has, too."""
+        return (0, 1, HEIGHT) if self._raised[k] else (0, 1)
+
     # -- the window ---------------------------------------------------------------------------------------------------
 
     def _steps(self, begin_s: float, end_s: float) -> Steps:
@@ -210,7 +241,7 @@ class Window:
         steps = self._steps(begin_s, end_s)
         return BatchProblem(
             steps, readings, times_s, self._run.first_pose, self._cfg, used, self._rest, self._marginal,
-            self.noise, self._places,
+            self.noise, self._places, self._raised,
         )  # fmt: skip
 
     def _solution(
@@ -245,7 +276,7 @@ class Window:
             shared[SHARED.index(name)] = value
         for k, name in enumerate(self._run.beacon_ids):
             if name in slam.beacons:
-                beacons[k, :2] = slam.beacons[name].mean[:2]
+                beacons[k, self._of_filter(k)] = slam.engine.mean[slam.place(name)]
         return BatchState(filtered, shared, beacons)
 
     def _correct(self, slam: BeaconSlam, solved: _Solved, time_s: float) -> None:
@@ -257,17 +288,23 @@ class Window:
         rows = [*range(POSE), *(POSE + SHARED.index(name) for name in names)]
         placed = [k for k, name in enumerate(self._run.beacon_ids) if self._stands[k] and name in slam.beacons]
         for k in placed:
-            start = POSE + len(SHARED) + BEACON * k
-            rows += (start, start + 1)
+            rows += [POSE + len(SHARED) + BEACON * k + state for state in self._of_filter(k)]
         values = np.concatenate([solved.state.poses[-1], solved.state.shared, solved.state.beacons.ravel()])
         slam.replace(time_s, names, [self._run.beacon_ids[k] for k in placed], values[rows], whole[np.ix_(rows, rows)])
 
     def _learn(self, solved: _Solved) -> None:
         """Give the prior of each calibration its weight at this solution, and estimate the noise of the odometry."""
         free = np.flatnonzero(solved.problem.free[: len(SHARED)])
-        variances = solved.factored.shared_covariance().diagonal()[: free.size]
-        squares = (solved.state.shared[free] ** 2 + variances).tolist()
-        priors = reweighted(self._configured.priors, dict(zip([SHARED[k] for k in free], squares, strict=True)))
+        variances = solved.problem.spread(solved.factored.shared_covariance().diagonal())
+        squares = {SHARED[k]: [solved.state.shared[k] ** 2 + variances[k]] for k in free}
+        for name in squares.keys() & ANTENNA:
+            value, variance = float(solved.state.shared[SHARED.index(name)]), float(variances[SHARED.index(name)])
+            assumed, scale = (getattr(p, name) for p in (solved.problem.priors, self._configured.priors))
+            squares[name] = [settled_square(value, variance, assumed, self._configured.priors.core * scale)]
+        raised = solved.problem.used & self._raised
+        of_heights = variances[len(SHARED) :].reshape(-1, BEACON)[raised, HEIGHT]
+        squares[HEIGHT_M2] = (solved.state.beacons[raised, HEIGHT] ** 2 + of_heights).tolist()
+        priors = reweighted(self._configured.priors, squares)
         self.odometry = odometry_noise(*solved[:3], self._configured.odometry, self.odometry, self._odometry_before)
         odometry = self.odometry.of(self._configured.odometry)
         self._cfg = self._cfg.model_copy(update={"priors": priors, "odometry": odometry})
@@ -308,9 +345,8 @@ class Window:
         shared, beacons = np.zeros(len(SHARED)), np.zeros((len(used), BEACON))
         rows = [*range(POSE), *(POSE + SHARED.index(name) for name in names)]
         for k in placed:
-            start = POSE + len(SHARED) + BEACON * k
-            rows += (start, start + 1)
-            beacons[k, :2] = slam.beacons[self._run.beacon_ids[k]].mean[:2]
+            rows += [POSE + len(SHARED) + BEACON * k + state for state in self._of_filter(k)]
+            beacons[k, self._of_filter(k)] = slam.engine.mean[slam.place(self._run.beacon_ids[k])]
         for name, (value, _) in slam.calibration.items():
             shared[SHARED.index(name)] = value
         pose, P = slam.marginal(time_s, names, [self._run.beacon_ids[k] for k in placed])
@@ -318,8 +354,8 @@ class Window:
         information = np.zeros((size, size))
         information[np.ix_(rows, rows)] = np.linalg.inv(P)
         # The filter's calibration and known places have priors, which stay where they are.
-        assumed, side, own = np.zeros((size, size)), np.zeros(size), rows[POSE : POSE + len(names)]
-        assumed[own, own] = of_priors(self.assumed, used)[1][np.array(own, dtype=int) - POSE]
+        assumed, side, own = np.zeros((size, size)), np.zeros(size), np.array(rows[POSE:], dtype=int)
+        assumed[own, own] = of_priors(self.assumed, used, self._raised)[1][own - POSE]
         values = np.concatenate([shared, beacons.ravel()])
         side[POSE:] = assumed.diagonal()[POSE:] * values
         if self._places is not None:  # a beacon that was removed is not where it was surveyed

@@ -485,6 +485,8 @@ def test_a_range_that_is_shorter_than_the_height(tmp_path: Path) -> None:
     run = read_run(write_lines(tmp_path / "a.csv", small("beacon,a,1,1,3.5", "antenna,0,0,0.5")), None, None)
     assert "1 range shorter than the beacon is above the antenna, not used, the first at 1.5 s" in run.warnings
     assert run.readings.range_m.tolist() == [4.0]  # of 5 m, 3 m above
+    assert "a" in run.levelled
+    assert run.raised.tolist() == [name != "a" for name in run.beacon_ids]  # its height is not estimated again
 
 
 def test_an_antenna_and_a_truth_without_headings(tmp_path: Path) -> None:

@@ -51,7 +51,8 @@ NO_PRIORS = PriorsConfig(
 PRIORS = PriorsConfig(
     distance_scale=0.1, distance_per_rad=0.05, turn_scale=0.1, turn_per_m=0.05, turn_bias_rad_s=0.02,
     odometry_delay_s=0.2, range_scale=0.1, range_offset_m=0.3, bearing_offset_rad=0.02, rssi_reference_db=5.0,
-    rssi_exponent=0.4, beacon_offset_m=0.1, beacon_reference_db=2.0, pose_m=0.05, heading_rad=0.03, core=0.5,
+    rssi_exponent=0.4, beacon_offset_m=0.1, beacon_reference_db=2.0, beacon_height_m2=1.0, antenna_ahead_m=0.2,
+    antenna_left_m=0.2, pose_m=0.05, heading_rad=0.03, core=0.5,
 )  # fmt: skip
 OF_PROBLEM = RecordingConfig(odometry=ODOMETRY, radio=RADIO, priors=PRIORS)
 
@@ -77,12 +78,13 @@ def problem() -> tuple[BatchProblem, BatchState]:
         np.array([nan, -52.0, nan, nan, -50.0, -55.0]),
     )
     times = np.union1d(s.times_s[:1], t)
-    made = BatchProblem(s, readings, times, (0.1, -0.2, 0.3), OF_PROBLEM, np.ones(2, dtype=bool), rest=(0.3, 0.5))
+    both = np.ones(2, dtype=bool)
+    made = BatchProblem(s, readings, times, (0.1, -0.2, 0.3), OF_PROBLEM, both, rest=(0.3, 0.5), raised=both)
     assert made.reckoning.at_rest[0] > 0.0
     poses = np.column_stack([np.interp(times, s.times_s, c) for c in dead_reckoned(s, (0.1, -0.2, 0.3)).T])
     poses += 0.05 * rng.standard_normal(poses.shape)
     shared = 0.02 * rng.standard_normal(len(SHARED))
-    beacons = np.column_stack([[2.0, -1.5], [3.0, 1.0], 0.02 * rng.standard_normal((2, 2))])
+    beacons = np.column_stack([[2.0, -1.5], [3.0, 1.0], 0.02 * rng.standard_normal((2, 3))])
     return made, BatchState(poses, shared, beacons)
 
 

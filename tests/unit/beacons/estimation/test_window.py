@@ -12,9 +12,11 @@ from ccatp.beacons.estimation.batch_smoother import smooth
 from ccatp.beacons.estimation.causal import filter_run, follow
 from ccatp.beacons.estimation.evaluation import judge
 from ccatp.beacons.estimation.least_squares import Factored, eliminated
+from ccatp.beacons.estimation.measurement_models import ANTENNA
 from ccatp.beacons.estimation.range_noise import correlations, range_noise, readings_as_one
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
-from ccatp.beacons.estimation.window import reweighted
+from ccatp.beacons.estimation.track_review import range_residuals
+from ccatp.beacons.estimation.window import reweighted, settled_square
 from ccatp.beacons.filters.ekf_slam import EkfSlam
 from ccatp.beacons.studies.trait_runs import trait_run
 from ccatp.core import FloatArray
@@ -118,12 +120,40 @@ def test_a_prior_has_the_weight_of_student_s_t() -> None:
     """Its width grows with the calibration without a step, and without any reading it is that of the core."""
     priors = CONFIG.csv.priors
     core = priors.core * priors.range_scale
-    widths = [reweighted(priors, {"range_scale": (k * core) ** 2}).range_scale for k in range(41)]
+    widths = [reweighted(priors, {"range_scale": [(k * core) ** 2]}).range_scale for k in range(41)]
     assert reweighted(priors, {}).range_scale == pytest.approx(core)
     assert widths[1] == pytest.approx(core)
     assert np.all(np.diff(widths) > 0.0)
     assert np.all(np.diff(widths) < 0.5 * core)
     assert reweighted(priors, {}).rssi_reference_db == priors.rssi_reference_db
+
+
+@pytest.mark.parametrize(("value", "sigma", "is_found"), [(0.4, 0.02, True), (0.4, 0.1, False), (0.0, 1e3, False)])
+def test_the_weight_of_a_prior_converges_in_one_solution(value: float, sigma: float, is_found: bool) -> None:
+    """To that at which the estimate has this weight; a value of many cores is found where the readings are clear."""
+    scale = 0.01
+
+    def under(width: float) -> tuple[float, float]:
+        variance = 1.0 / (sigma**-2 + width**-2)
+        return variance * value / sigma**2, variance
+
+    square = settled_square(*under(scale), scale, scale)
+    mean, variance = under(float(np.sqrt((8.0 * scale**2 + square) / 9.0)))
+    assert mean**2 + variance == pytest.approx(square, rel=1e-6)
+    assert (abs(mean) > 0.8 * 0.4) == is_found
+
+
+def test_its_ellipses_contain_the_truth_where_neither_heights_nor_the_antenna_are_known() -> None:
+    run = trait_run(("heights",), 0)
+    track = estimated(run, Settings(CONFIG.csv, CONFIG.filter), CONFIG.fixed_lag)
+    found = judge(track, run).nees
+    assert found is not None
+    assert found.mean < 2.0
+    for name, true_m in zip(ANTENNA, (0.4, 0.2), strict=True):
+        value, sigma = track.calibration[name]
+        assert abs(value - true_m) < 4.0 * sigma < 0.1
+    off_m = range_residuals(run, track, 0.0)[len(run.readings.times_s) // 2 :]
+    assert np.median(np.abs(off_m)) < 0.1  # with the heights and the antenna that were found
 
 
 # -- its parts --------------------------------------------------------------------------------------------------------
