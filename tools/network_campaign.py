@@ -1,15 +1,19 @@
 """Synthetic laser networks with known errors: does the self-calibration find them, and do its intervals hold?
 
-Only lengths are simulated, no robot: ``python -m tools.network_campaign [--networks N] [--seed S] [--mirror NAME]``.
+Only lengths are simulated, no robot:
+``python -m tools.network_campaign [--networks N] [--seed S] [--mirror NAME] [--kind KIND]``.
 Each network has errors as its priors say, and larger ones with some probability: offsets of channels up to 1 mm,
 collimators moved by up to 2 mm, a scale up to 5 ppm, a drift up to 2 ppm per hour, noise up to three times the
-configured one. The panels are misaligned, too. One network in five has no error beyond its priors.
+configured one. The panels are misaligned, too. One network in five has no error beyond its priors. ``--kind`` adds an
+error to every network: one channel with 3 to 10 times the noise of the others, or a scale that oscillates with 1 to
+3 ppm and a period of 5 to 30 minutes.
 """
 
 import argparse
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from enum import StrEnum
 from functools import cache
 from itertools import repeat
 from typing import NamedTuple
@@ -27,8 +31,20 @@ from ccatp.mirror.network_model import Effect, EffectKind, SurveyLengths, adjust
 from ccatp.mirror.panel_alignment import rigid
 
 MIRRORS = ("thesis-m1", "fyst-m1", "fyst-m2", "thesis-m2")
+
+
+class Kind(StrEnum):
+    """What every network has besides the errors that are drawn for each."""
+
+    USUAL = "usual"  # nothing
+    NOISY_CHANNEL = "noisy channel"
+    OSCILLATING_SCALE = "oscillating scale"
+
+
 _SHARE = 0.2  # of channels with an offset, and of moved collimators
 _LARGEST = {EffectKind.OFFSET: 1e-3, EffectKind.COLLIMATOR: 2e-3, EffectKind.SCALE: 5e-6, EffectKind.DRIFT: 2e-6}
+_SCALE, _DRIFT, _VARIATION = (Effect(one, 0) for one in (EffectKind.SCALE, EffectKind.DRIFT, EffectKind.VARIATION))
+_TIMES = 20  # of a survey, at which its scale is compared
 _INTERVAL = 1.959964  # sigmas of a 95 % interval
 
 
@@ -43,13 +59,18 @@ class Places(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """A drawn network: the true points, its lengths, the value of each effect, and which of them were injected."""
+    """A drawn network: the true points, its lengths, the value of each effect, and which of them were injected.
+
+    ``noise``: over the configured one; ``channel_noise`` (m,): of each channel over that. ``scale`` (k,).
+    """
 
     points_m: FloatArray
     given: SurveyLengths
     values: dict[Effect, FloatArray]
     injected: frozenset[Effect]
     noise: float
+    channel_noise: FloatArray
+    scale: FloatArray
 
 
 class Outcome(NamedTuple):
@@ -71,6 +92,7 @@ class Outcome(NamedTuple):
     has_frame: bool
     missed: int
     injected: int
+    names_the_kind: bool
 
 
 def places_of(cfg: Config) -> Places:
@@ -103,7 +125,7 @@ def _pucks(cfg: Config, places: Places, rng: np.random.Generator) -> FloatArray:
     return np.array(found)
 
 
-def draw(cfg: Config, places: Places, rng: np.random.Generator) -> Truth:
+def draw(cfg: Config, places: Places, rng: np.random.Generator, kind: Kind = Kind.USUAL) -> Truth:
     """One network with its survey of an hour."""
     collimators = np.array(places.mirror.collimators_m)
     effects = equal_effects(len(collimators), 1)
@@ -130,10 +152,20 @@ def draw(cfg: Config, places: Places, rng: np.random.Generator) -> Truth:
     scale = values[Effect(EffectKind.SCALE, 0)] + values[Effect(EffectKind.DRIFT, 0)] * hours
     distances = np.linalg.norm(pucks[:, None] - moved, axis=2)
     sigmas = cfg.etalon.length_sigma_m + cfg.etalon.length_sigma_per_m * distances
-    lengths = distances * (1.0 + scale[:, None]) + offsets + noise * sigmas * rng.normal(size=distances.shape)
+    errors, channel_noise = noise * sigmas * rng.normal(size=distances.shape), np.ones(len(collimators))
+    match kind:
+        case Kind.NOISY_CHANNEL:
+            channel_noise[rng.integers(len(collimators))] = rng.uniform(3.0, 10.0)
+            errors *= channel_noise
+        case Kind.OSCILLATING_SCALE:
+            period_h, phase = rng.uniform(5.0, 30.0) / 60.0, rng.uniform(0.0, 2.0 * np.pi)
+            scale += rng.uniform(1e-6, 3e-6) * np.cos(2.0 * np.pi * hours / period_h + phase)
+            # The line that fits it best is a scale and a drift.
+            injected |= {_SCALE, _DRIFT, _VARIATION}
+    lengths = distances * (1.0 + scale[:, None]) + offsets + errors
     survey = np.zeros(len(pucks), dtype=np.int64)
     given = SurveyLengths(lengths, sigmas, collimators, places.nominal_m, hours, survey)
-    return Truth(pucks, given, values, frozenset(injected), noise)
+    return Truth(pucks, given, values, frozenset(injected), noise, channel_noise, scale)
 
 
 def judge(cfg: Config, places: Places, truth: Truth) -> Outcome:
@@ -150,6 +182,9 @@ def judge(cfg: Config, places: Places, truth: Truth) -> Outcome:
     found = {one.effect for one in result.findings if not one.alternatives}
     named = found | {other for one in result.findings for other in (one.effect, *one.alternatives)}
     same = {(one.kind, one.of) for one in truth.injected}
+    may_begin = {EffectKind.SCALE} if _VARIATION in truth.injected else set()
+    is_noisy = truth.channel_noise > 1.0
+    is_named = result.channel_noise > result.noise
     covered = _coverage(truth, result)
     # A point that is left out determines nothing of its panel.
     is_whole = np.repeat(~result.bad_points.reshape(len(places.panels), -1).any(axis=1), 3)
@@ -166,12 +201,16 @@ def judge(cfg: Config, places: Places, truth: Truth) -> Outcome:
         panel_chi2=float(flat @ np.linalg.solve(covariance, flat)),
         panel_dof=len(flat),
         covered=covered,
-        false_findings=sum((one.kind, one.of) not in same or one.since > 0 for one in found),
+        false_findings=int(np.sum(is_named & ~is_noisy))
+        + sum((one.kind, one.of) not in same or (one.since > 0 and one.kind not in may_begin) for one in found),
         undecided=sum(bool(one.alternatives) for one in result.findings),
         left_out=int(result.bad_lengths.sum() + result.bad_points.sum()),
         has_frame=result.has_frame,
-        missed=len(same - {(one.kind, one.of) for one in named}) if result.has_frame else 0,
-        injected=len(same),
+        missed=(len(same - {(one.kind, one.of) for one in named}) if result.has_frame else 0)
+        + int(np.sum(is_noisy & ~is_named)),
+        injected=len(same) + int(is_noisy.sum()),
+        names_the_kind=bool(is_named[is_noisy].all())
+        and (_VARIATION not in truth.injected or any(one.kind is EffectKind.VARIATION for one in named)),
     )
 
 
@@ -195,21 +234,31 @@ def _panel_covariance(places: Places, result: NetworkResult) -> FloatArray:
 
 
 def _coverage(truth: Truth, result: NetworkResult) -> dict[str, tuple[int, int]]:
-    """By kind: values inside their 95 % interval, and all of them."""
-    covered: dict[str, tuple[int, int]] = {}
+    """By kind: values inside their 95 % interval, and all of them; scale and drift of the line that fits it best."""
+    adjusted, covered = result.adjustment, dict[str, tuple[int, int]]()
     for effect, value in truth.values.items():
-        sigma = np.sqrt(np.diag(result.adjustment.covariance_of(effect)))
-        total = result.adjustment.of(effect).copy()
-        inside, of = covered.get(effect.kind.value, (0, 0))
-        hits = int(np.sum(np.abs(total - value) <= _INTERVAL * sigma))
-        covered[effect.kind.value] = inside + hits, of + effect.size
+        if effect.is_of_channel:
+            sigma = np.sqrt(np.diag(adjusted.covariance_of(effect)))
+            inside, of = covered.get(effect.kind.value, (0, 0))
+            hits = int(np.sum(np.abs(adjusted.of(effect) - value) <= _INTERVAL * sigma))
+            covered[effect.kind.value] = inside + hits, of + effect.size
+    hours = truth.given.hours
+    line = np.linalg.pinv(np.column_stack([np.ones_like(hours), hours]))
+    parts = {EffectKind.SCALE: line[:1], EffectKind.DRIFT: line[1:]}
+    if _VARIATION in truth.injected:
+        parts[EffectKind.VARIATION] = np.eye(len(hours))[:: len(hours) // _TIMES]
+    for kind, part in parts.items():
+        design = part @ adjusted.scale_design
+        sigma = np.sqrt(np.sum((design @ adjusted.covariance) * design, axis=1))
+        errors = design @ adjusted.values - part @ truth.scale
+        covered[kind.value] = int(np.sum(np.abs(errors) <= _INTERVAL * sigma)), len(part)
     return covered
 
 
-def one_network(name: str, seed: int, number: int) -> Outcome:
+def one_network(name: str, seed: int, number: int, kind: Kind = Kind.USUAL) -> Outcome:
     """The outcome of one network, which has a random generator of its own."""
     cfg, places = _world(name)
-    return judge(cfg, places, draw(cfg, places, np.random.default_rng([seed, number])))
+    return judge(cfg, places, draw(cfg, places, np.random.default_rng([seed, number]), kind))
 
 
 @cache
@@ -218,14 +267,16 @@ def _world(name: str) -> tuple[Config, Places]:
     return cfg, places_of(cfg)
 
 
-def campaign(networks: int, seed: int, mirrors: Sequence[str] = MIRRORS, workers: int = 0) -> list[tuple[str, Outcome]]:
+def campaign(
+    networks: int, seed: int, mirrors: Sequence[str] = MIRRORS, kind: Kind = Kind.USUAL, workers: int = 0
+) -> list[tuple[str, Outcome]]:
     """Outcomes of networks on each mirror in turn; in this process without ``workers``."""
     names = [mirrors[number % len(mirrors)] for number in range(networks)]
+    which = names, repeat(seed), range(networks), repeat(kind)
     if not workers:
-        found = map(one_network, names, repeat(seed), range(networks))
-        return list(zip(names, found, strict=True))
+        return list(zip(names, map(one_network, *which), strict=True))
     with ProcessPoolExecutor(workers) as pool:
-        return list(zip(names, pool.map(one_network, names, repeat(seed), range(networks)), strict=True))
+        return list(zip(names, pool.map(one_network, *which), strict=True))
 
 
 def lines(outcomes: Sequence[tuple[str, Outcome]]) -> list[str]:
@@ -244,7 +295,8 @@ def lines(outcomes: Sequence[tuple[str, Outcome]]) -> list[str]:
     shares = []
     for kind in kinds:
         hits, of = (sum(one.covered.get(kind, (0, 0))[k] for one in found) for k in (0, 1))
-        shares.append(f"{kind} {100.0 * hits / max(of, 1):.1f} % of {of}")
+        if of:
+            shares.append(f"{kind} {100.0 * hits / of:.1f} % of {of}")
     seconds = [one.seconds for one in found]
     injected, missed = sum(one.injected for one in found), sum(one.missed for one in found)
     return [
@@ -256,7 +308,8 @@ def lines(outcomes: Sequence[tuple[str, Outcome]]) -> list[str]:
         f"networks with a false finding: {false} ({100.0 * false / len(found):.1f} %); of {injected} injected errors "
         f"{missed} not named, {sum(one.undecided for one in found)} findings undecided; "
         f"{sum(one.left_out for one in found)} lengths or points left out, "
-        f"{sum(not one.has_frame for one in found)} networks without a frame",
+        f"{sum(not one.has_frame for one in found)} networks without a frame; "
+        f"the error of the kind is named in {sum(one.names_the_kind for one in found)} networks",
         f"CPU time of a network: {np.median(seconds):.2f} s in the median, {max(seconds):.2f} s at most",
     ]
 
@@ -268,8 +321,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--mirror", action="append", choices=MIRRORS)
+    parser.add_argument("--kind", choices=[kind.value for kind in Kind], default=Kind.USUAL.value)
     args = parser.parse_args()
-    outcomes = campaign(args.networks, args.seed, tuple(args.mirror or MIRRORS), args.workers)
+    outcomes = campaign(args.networks, args.seed, tuple(args.mirror or MIRRORS), Kind(args.kind), args.workers)
     print("\n".join(lines(outcomes)))
     for name in dict.fromkeys(name for name, _ in outcomes):
         print(f"\n{name}")

@@ -256,9 +256,8 @@ def rows(outcomes: Sequence[Outcome]) -> list[str]:
 
 def totals(outcomes: Sequence[Outcome]) -> list[str]:
     """All surveys in a few lines."""
-    kinds = [*(kind.value for kind in EffectKind), "panel"]
     parts = []
-    for kind in kinds:
+    for kind in outcomes[0].covered:
         hits, of = (sum(one.covered[kind][k] for one in outcomes) for k in (0, 1))
         parts.append(f"{kind} {100.0 * hits / of:.1f} % of {of}")
     chi2, dof = sum(one.chi2 for one in outcomes), sum(one.dof for one in outcomes)

@@ -1,10 +1,10 @@
 """The lengths of a survey as functions of the points and the network, and one adjustment of both by least squares.
 
 A length is ``|x_k - a_i - d_i| (1 + s) + o_i``: point ``x_k``, configured collimator ``a_i``, its move ``d_i``, offset
-``o_i`` of the channel, scale ``s`` (refraction) with a drift. An ``Effect`` is one block of these unknowns; it may hold
-from some point on only. The points are eliminated: ``M = W - W H (H^T W H)^-1 H^T W`` is the weight that is left to the
-lengths of a point for the network. Each effect has a normal prior of mean 0, so that the solution always exists; rigid
-motions of the collimators move all points alike, show in no length, and keep their prior.
+``o_i`` of the channel, scale ``s`` (refraction) with a drift and a variation. An ``Effect`` is one block of these
+unknowns; it may hold from some point on only. The points are eliminated: ``M = W - W H (H^T W H)^-1 H^T W`` is the
+weight that is left to the lengths of a point for the network. Each effect has a normal prior of mean 0, so that the
+solution always exists; rigid motions of the collimators move all points alike, show in no length, and keep their prior.
 """
 
 from collections.abc import Sequence
@@ -28,19 +28,23 @@ class EffectKind(StrEnum):
     COLLIMATOR = "collimator"  # move of a collimator, world frame, m
     SCALE = "scale"  # of all lengths of a survey
     DRIFT = "drift"  # of the scale of a survey, 1/h, zero in the middle of its time
+    VARIATION = "variation"  # of the scale of a survey about its drift: amplitudes of cosines of time
 
 
 class Effect(NamedTuple):
     """One block of unknowns: of a channel (its column), or of a survey (its number).
 
     ``since``: the first point at which it holds. ``until``: the first one after it at which it does not hold any more,
-    the beginning of a later survey; 0: it holds to the end.
+    the beginning of a later survey; 0: it holds to the end. A variation has ``terms`` cosines of ``order`` and the next
+    ones; the order is the number of half waves in the survey.
     """
 
     kind: EffectKind
     of: int
     since: int = 0
     until: int = 0
+    order: int = 0
+    terms: int = 1
 
     @property
     def part(self) -> slice:
@@ -55,7 +59,7 @@ class Effect(NamedTuple):
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return _AXES if self.kind is EffectKind.COLLIMATOR else 1
+        return _AXES if self.kind is EffectKind.COLLIMATOR else self.terms
 
     @property
     def is_of_channel(self) -> bool:
@@ -124,6 +128,12 @@ class Adjustment(NamedTuple):
         return self.covariance[part, part]
 
     @property
+    def scale_design(self) -> FloatArray:
+        """Change of the scale at each point per unknown, (k, n); with ``values`` the scale of its lengths."""
+        is_scale = np.concatenate([np.full(effect.size, not effect.is_of_channel) for effect in self.slices])
+        return np.where(is_scale, self.design[:, 0] / self.distances_m[:, :1], 0.0)
+
+    @property
     def by_survey(self) -> FloatArray:
         """The part of the covariance that differs between surveys, (n, n).
 
@@ -133,6 +143,21 @@ class Adjustment(NamedTuple):
         is_common = np.concatenate([np.full(effect.size, effect.is_of_channel) for effect in self.slices])
         scaled = (self.covariance / np.sqrt(self.prior)[:, None])[is_common]
         return np.asarray(self.covariance - scaled.T @ scaled)
+
+
+def variation_shapes(effect: Effect, given: SurveyLengths) -> FloatArray:
+    """The cosines of a variation at each point, (k, terms), 0 at those of other surveys.
+
+    Each is without the line that fits it best, which is a scale and a drift.
+    """
+    is_own = given.survey == effect.of
+    hours = given.hours[is_own]
+    time = hours / max(float(np.ptp(hours)), 1e-12)  # -1/2 to 1/2
+    orders = np.arange(effect.order, effect.order + effect.terms)
+    slopes = np.where(orders % 2 == 1, -24.0 / (np.pi * orders) ** 2, 0.0)
+    found = np.zeros((len(given.hours), effect.terms))
+    found[is_own] = np.cos(np.pi * orders * (time[:, None] + 0.5)) - slopes * time[:, None]
+    return found
 
 
 def columns_of(effect: Effect, given: SurveyLengths, directions: FloatArray, distances_m: FloatArray) -> FloatArray:
@@ -150,6 +175,8 @@ def columns_of(effect: Effect, given: SurveyLengths, directions: FloatArray, dis
         case EffectKind.DRIFT:
             hours = given.hours[part] * (given.survey[part] == effect.of)
             found[part, :, 0] = distances_m[part] * hours[:, None]
+        case EffectKind.VARIATION:
+            found[part] = distances_m[part, :, None] * variation_shapes(effect, given)[part, None, :]
     return found
 
 
@@ -175,6 +202,8 @@ def _predict(given: SurveyLengths, slices: dict[Effect, slice], values: FloatArr
                 scale[at] += values[part] * (given.survey[at] == effect.of)
             case EffectKind.DRIFT:
                 scale[at] += values[part] * given.hours[at] * (given.survey[at] == effect.of)
+            case EffectKind.VARIATION:
+                scale[at] += variation_shapes(effect, given)[at] @ values[part]
     away = points_m[:, None, :] - given.collimators_m - moved
     distances = np.sqrt(np.sum(away * away, axis=2))
     directions = away / np.maximum(distances, 1e-12)[..., None]
@@ -311,13 +340,19 @@ def score_since(found: Adjustment, base: Effect, given: SurveyLengths, firsts: I
     return _shown(score, since(mine[..., rows] @ columns), since(mine @ found.design), found.covariance)
 
 
-def length_scores(found: Adjustment) -> FloatArray:
-    """The chi-square that an error of each single length would take away, (k, m); 0 where it does not show."""
+def length_information(found: Adjustment) -> FloatArray:
+    """Inverse variance of each length minus what all others say of it, (k, m), 1/m^2; 0 where they say nothing."""
     own = np.diagonal(found.weights, axis1=1, axis2=2)
     cross = found.weights @ found.design
     left = own - np.sum((cross @ found.covariance) * cross, axis=2)
     is_shown = left > _LEAST_VISIBLE * np.maximum(own.max(axis=1, keepdims=True), 1e-300)
-    return np.asarray(np.where(is_shown, found.weighted**2 / np.where(is_shown, left, 1.0), 0.0))
+    return np.asarray(np.where(is_shown, left, 0.0))
+
+
+def length_scores(found: Adjustment) -> FloatArray:
+    """The chi-square that an error of each single length would take away, (k, m); 0 where it does not show."""
+    left = length_information(found)
+    return np.asarray(np.where(left > 0.0, found.weighted**2 / np.where(left > 0.0, left, 1.0), 0.0))
 
 
 def equal_effects(channels: int, surveys: int) -> Sequence[Effect]:

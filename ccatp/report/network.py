@@ -1,7 +1,6 @@
 """The laser network of a survey in words and as data: whether it is consistent, what changed, what is open."""
 
-from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ def sentence(found: CalibratedSurveys | None) -> str:
         return "The laser network is not checked: no lengths are recorded."
     network = found.network
     lengths = int(np.isfinite(network.given.lengths_m).sum())
-    noise = f"noise {network.noise:.2f} times the configured one" if network.is_noisy else "noise as configured"
+    noise = _noise(found)
     if network.state is NetworkState.TOO_FEW:
         return f"The laser network is not checked: {len(found.points)} points with {lengths} lengths are too few."
     if network.state is NetworkState.CONSISTENT:
@@ -35,6 +34,21 @@ def sentence(found: CalibratedSurveys | None) -> str:
         )
     changes = "; ".join(_changes(found))
     return f"The laser network has changed: {changes} ({noise}); the panels are computed with it."
+
+
+def _noise(found: CalibratedSurveys) -> str:
+    """The noise of the lengths, and that of channels which have more of it than the others."""
+    network = found.network
+    text = f"noise {network.noise:.2f} times the configured one" if network.is_noisy else "noise as configured"
+    channels = [f"in channel {channel} {noise:.1f} times the configured one" for channel, noise in _noisy(found)]
+    return ", ".join([text, *channels])
+
+
+def _noisy(found: CalibratedSurveys) -> list[tuple[int, float]]:
+    """Channels with a noise of their own, over the configured one."""
+    network = found.network
+    columns = np.flatnonzero(network.channel_noise > network.noise).tolist()
+    return [(found.channels[column], float(network.channel_noise[column])) for column in columns]
 
 
 def _share_um(found: CalibratedSurveys) -> float:
@@ -61,6 +75,11 @@ def remarks(found: CalibratedSurveys | None) -> list[str]:
             f"the lengths have {network.noise:.2f} times the configured noise (etalon.length_sigma_m); "
             "all standard deviations are larger in proportion"
         )
+    lines += [
+        f"the lengths of channel {channel} have {noise:.1f} times the configured noise, and count accordingly less: "
+        "check its fibre, its beam and its collimator"
+        for channel, noise in _noisy(found)
+    ]
     without = sum(one.unchanged for one in found.surveys)
     if without:
         lines.append(f"{without} fixes have no lengths of this network: they are used as recorded")
@@ -81,11 +100,15 @@ def air_text(found: CalibratedSurveys | None) -> str:
         return ""
     adjusted, parts = found.network.adjustment, []
     for effect in adjusted.slices:
-        if effect.is_of_channel or effect.since:
+        if effect.is_of_channel or effect.since or effect.kind is EffectKind.VARIATION:
             continue
         value, sigma = float(adjusted.of(effect)[0]), float(np.sqrt(adjusted.covariance_of(effect)[0, 0]))
         unit = "ppm" if effect.kind is EffectKind.SCALE else "ppm per hour"
         parts.append(f"{effect.kind}{_of_survey(found, effect)} {_ppm(value, sigma, '+')} {unit}")
+    varied = {one.effect.of: one.effect for one in found.network.findings if one.effect.kind is EffectKind.VARIATION}
+    for effect in varied.values():
+        rms, sigma = _variation(found, effect.of)
+        parts.append(f"a variation of the scale{_of_survey(found, effect)} of {_ppm(rms, sigma)} ppm rms")
     return f"The panels are computed with {', '.join(parts)}."
 
 
@@ -96,29 +119,80 @@ def network_lines(found: CalibratedSurveys | None) -> list[str]:
 
 
 def _changes(found: CalibratedSurveys) -> Iterator[str]:
-    """Each finding; many changes of one channel together, which are the parts of one that is not in the model."""
+    """Each finding; many changes of one channel together, which are the parts of one that is not in the model.
+
+    So are the changes of a noisy channel, and the bands and steps of a scale that varies.
+    """
     findings = found.network.findings
-    channels = Counter(one.effect.of for one in findings if one.effect.is_of_channel)
-    stated = set[int]()
+    noisy = {channel for channel, _ in _noisy(found)}
+    varied = {one.effect.of for one in findings if one.effect.kind is EffectKind.VARIATION}
+
+    def is_part(one: Effect) -> bool:
+        """Of the variation of a scale."""
+        is_step = one.kind is EffectKind.SCALE and one.since > 0
+        return (is_step or one.kind is EffectKind.VARIATION) and one.of in varied
+
+    stated = set[tuple[bool, int]]()
     for one in findings:
-        of = one.effect.of
-        if not one.effect.is_of_channel or channels[of] < _MANY_CHANGES:
+        effect = one.effect
+        same = [
+            other for other in findings if other.effect.of == effect.of
+            and (other.effect.is_of_channel if effect.is_of_channel else is_part(other.effect))
+        ]  # fmt: skip
+        least = 2 if effect.is_of_channel and found.channels[effect.of] in noisy else _MANY_CHANGES
+        if not (len(same) >= least if effect.is_of_channel else is_part(effect)):
             yield finding_text(found, one)
-        elif of not in stated:
-            stated.add(of)
-            sizes = [abs(other.size) for other in findings if other.effect.is_of_channel and other.effect.of == of]
-            yield (
-                f"channel {found.channels[of]} changes {len(sizes)} times, by up to {MICRO * max(sizes):.1f} um: it "
-                "drifts or is noisy, or its collimator moves"
-            )
+        elif (effect.is_of_channel, effect.of) not in stated:
+            stated.add((effect.is_of_channel, effect.of))
+            if effect.is_of_channel:
+                size_um = MICRO * max(abs(other.size) for other in same)
+                yield (
+                    f"channel {found.channels[effect.of]} changes {len(same)} times, by up to {size_um:.1f} um: it "
+                    "drifts or is noisy, or its collimator moves"
+                )
+            else:
+                bands = [other.effect for other in same if other.effect.kind is EffectKind.VARIATION]
+                others = {other for finding in same for other in finding.alternatives if not is_part(other)}
+                yield _or_else(found, _variation_text(found, bands), sorted(others))
+
+
+def _variation_text(found: CalibratedSurveys, bands: Sequence[Effect]) -> str:
+    rms, _ = _variation(found, bands[0].of)
+    shortest, longest = zip(*(_periods_min(found, one) for one in bands), strict=True)
+    return (
+        f"the scale of all lengths{_of_survey(found, bands[0])} varies about its drift by {MICRO * rms:.2f} ppm rms, "
+        f"with periods of {min(shortest):.0f} to {max(longest):.0f} minutes"
+    )
+
+
+def _variation(found: CalibratedSurveys, survey: int) -> tuple[float, float]:
+    """Scale of a survey about its drift, and its standard deviation, rms over the points."""
+    given, adjusted = found.network.given, found.network.adjustment
+    is_own = given.survey == survey
+    hours = given.hours[is_own]
+    line, _ = np.linalg.qr(np.column_stack([np.ones_like(hours), hours]))
+    design = adjusted.scale_design[is_own]
+    about = design - line @ (line.T @ design)
+    variances = np.sum((about @ adjusted.covariance) * about, axis=1)
+    return float(np.sqrt(np.mean((about @ adjusted.values) ** 2))), float(np.sqrt(np.mean(variances)))
+
+
+def _periods_min(found: CalibratedSurveys, band: Effect) -> tuple[float, float]:
+    """Shortest and longest period of a band, minutes."""
+    given = found.network.given
+    minutes = 60.0 * float(np.ptp(given.hours[given.survey == band.of]))
+    return 2.0 * minutes / (band.order + band.terms - 1), 2.0 * minutes / band.order
 
 
 def finding_text(found: CalibratedSurveys, finding: Finding) -> str:
     """A change with its size; with alternatives, that the lengths do not decide."""
-    text = _change(found, finding)
-    if not finding.alternatives:
+    return _or_else(found, _change(found, finding), finding.alternatives)
+
+
+def _or_else(found: CalibratedSurveys, text: str, alternatives: Iterable[Effect]) -> str:
+    others = " or ".join(effect_name(found, one) for one in alternatives)
+    if not others:
         return text
-    others = " or ".join(effect_name(found, one) for one in finding.alternatives)
     return f"either {text}, or it is the {others}: the lengths do not decide"
 
 
@@ -141,6 +215,8 @@ def _change(found: CalibratedSurveys, finding: Finding) -> str:
             return (
                 f"the scale of all lengths drifts by {_ppm(size, sigma, '+')} ppm per hour{_of_survey(found, effect)}"
             )
+        case EffectKind.VARIATION:
+            return _variation_text(found, [effect])
 
 
 def _since(found: CalibratedSurveys, effect: Effect) -> str:
@@ -165,6 +241,7 @@ def effect_name(found: CalibratedSurveys, effect: Effect) -> str:
         EffectKind.COLLIMATOR: "collimator of channel",
         EffectKind.SCALE: "scale",
         EffectKind.DRIFT: "drift of the scale",
+        EffectKind.VARIATION: "variation of the scale",
     }
     number = f" {found.channels[effect.of]}" if effect.is_of_channel else ""
     return names[effect.kind] + number + _since(found, effect)
@@ -206,6 +283,7 @@ def network_data(found: CalibratedSurveys | None) -> dict[str, Any] | None:
         "undetermined": [_effect_data(found, one) for one in network.undetermined],
         "noise": round(network.noise, 4),
         "is_noisy": network.is_noisy,
+        "noisy_channels": [{"channel": channel, "noise": round(noise, 4)} for channel, noise in _noisy(found)],
         "chi2": round(network.chi2, 4),
         "dof": network.dof,
         "has_frame": network.has_frame,
@@ -237,11 +315,14 @@ def _effect_data(found: CalibratedSurveys, effect: Effect) -> dict[str, Any]:
     name = {"channel": found.channels[effect.of]} if effect.is_of_channel else {"survey": effect.of}
     since = list(found.points[effect.since][0]) if effect.since else None
     until = list(found.points[effect.until][0]) if effect.until else None
-    return {"kind": effect.kind.value, **name, "since": since, "until": until}
+    band = {}
+    if effect.kind is EffectKind.VARIATION:
+        band = {"periods_min": [round(one, 2) for one in _periods_min(found, effect)]}
+    return {"kind": effect.kind.value, **name, "since": since, "until": until, **band}
 
 
 def _values(effect: Effect, values: FloatArray, sigmas: FloatArray) -> dict[str, Any]:
-    unit = "um" if effect.is_of_channel else ("ppm" if effect.kind is EffectKind.SCALE else "ppm_per_h")
+    unit = "um" if effect.is_of_channel else ("ppm_per_h" if effect.kind is EffectKind.DRIFT else "ppm")
     return {
         f"value_{unit}": [round(MICRO * float(value), 4) for value in values],
         f"sigma_{unit}": [round(MICRO * float(sigma), 4) for sigma in sigmas],

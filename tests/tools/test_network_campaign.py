@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
-from tools.network_campaign import Outcome, campaign
+from tools.network_campaign import Kind, Outcome, campaign
 
 # By a binomial distribution, fewer have a chance below 1 in 1,000; the values of a network are hardly independent.
 LEAST = {"offset": 0.86, "collimator": 0.89, "scale": 0.80, "drift": 0.80, "panel": 0.91}
@@ -33,3 +33,12 @@ def test_what_is_injected_is_found_and_nothing_else(outcomes: list[Outcome]) -> 
     assert sum(one.false_findings for one in outcomes) == 0
     assert sum(one.missed for one in outcomes) < 0.3 * sum(one.injected for one in outcomes)
     assert np.median([one.after_m for one in outcomes]) < 0.02 * np.median([one.before_m for one in outcomes])
+
+
+@pytest.mark.parametrize("kind", [Kind.NOISY_CHANNEL, Kind.OSCILLATING_SCALE])
+def test_networks_with_an_error_more_have_panels_within_their_intervals(kind: Kind) -> None:
+    ((_, found),) = campaign(1, 12, ("thesis-m2",), kind)
+    hits, count = found.covered["panel"]
+    assert hits / count >= LEAST["panel"]
+    assert found.names_the_kind
+    assert found.false_findings == 0

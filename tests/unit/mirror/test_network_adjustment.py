@@ -1,21 +1,29 @@
 """The self-calibration of the laser network: against a dense solution, what it finds, and what it leaves open."""
 
+import re
 from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
-from ccatp.core import UNRELIABLE, FloatArray, Measured, PanelId, Vector3
+from ccatp.core import UNRELIABLE, FloatArray, Measured, PanelId, PointId, Vector3
 from ccatp.mirror.fix_judgement import FixJudge
 from ccatp.mirror.mirror_alignment import align_survey, compare
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.multilateration import solve_fix
-from ccatp.mirror.network_adjustment import NetworkResult, NetworkState, calibrate, change_price, prior_of_both
+from ccatp.mirror.network_adjustment import (
+    NetworkResult,
+    NetworkState,
+    calibrate,
+    change_price,
+    prior_of_both,
+    prior_of_many,
+)
 from ccatp.mirror.network_model import Effect, EffectKind, SurveyLengths, adjust, equal_effects, score_since
-from ccatp.mirror.network_points import calibrate_surveys
-from ccatp.report.network import network_data, remarks, sentence, undetermined_text
+from ccatp.mirror.network_points import CalibratedSurveys, CommonErrors, RefinedSurvey, calibrate_surveys
+from ccatp.report.network import air_text, network_data, remarks, sentence, undetermined_text
 from tests.support.length_surveys import places
 from tests.support.scenario import world_of
 
@@ -25,20 +33,29 @@ COLLIMATORS = np.array(M1.collimators_m)
 CHANNELS = len(COLLIMATORS)
 PUCKS = places(M1, HEIGHT_M)
 EVERY_FOURTH = PUCKS[::4]  # 174 points
-OFFSET, COLLIMATOR, SCALE, DRIFT = EffectKind
+OFFSET, COLLIMATOR, SCALE, DRIFT, VARIATION = EffectKind
 Errors = Mapping[Effect, FloatArray | float]
 NOTHING: Errors = {}
 
 
 def lengths(
-    errors: Errors, *, seed: int = 1, pucks: FloatArray = EVERY_FOURTH, noise: float = 1.0, surveys: int = 1
+    errors: Errors,
+    *,
+    seed: int = 1,
+    pucks: FloatArray = EVERY_FOURTH,
+    noise: float | FloatArray = 1.0,
+    surveys: int = 1,
+    wave: Callable[[FloatArray], FloatArray] = np.zeros_like,
 ) -> tuple[SurveyLengths, FloatArray]:
-    """Lengths with noise and these errors, and the true points, which are some mm beside the places."""
+    """Lengths with noise and these errors, and the true points, which are some mm beside the places.
+
+    ``noise``: over the configured one, of all channels or of each. ``wave``: scale by the hours.
+    """
     rng = np.random.default_rng(seed)
     points = pucks + rng.normal(size=pucks.shape) * 2e-3
     hours, survey = np.linspace(-0.5, 0.5, len(pucks)), np.arange(len(pucks)) * surveys // len(pucks)
     moved, offsets = np.zeros((len(pucks), CHANNELS, 3)), np.zeros((len(pucks), CHANNELS))
-    scale = np.zeros(len(pucks))
+    scale = wave(hours)
     for effect, value in errors.items():
         since = slice(effect.since, None)
         if effect.kind is COLLIMATOR:
@@ -62,8 +79,8 @@ def found_in(errors: Errors, **how: object) -> NetworkResult:
 
 
 def test_the_adjustment_is_the_dense_least_squares_solution_of_points_and_network_together() -> None:
-    step = Effect(OFFSET, 2, 7)
-    sigmas = {one: 1e-3 if one.is_of_channel else 1e-5 for one in equal_effects(CHANNELS, 2)} | {step: 1e-3}
+    step, wave = Effect(OFFSET, 2, 7), Effect(VARIATION, 1, order=2, terms=2)
+    sigmas = {one: 1e-3 if one.is_of_channel else 1e-5 for one in equal_effects(CHANNELS, 2)} | {step: 1e-3, wave: 1e-5}
     errors: Errors = {Effect(COLLIMATOR, 1): np.array([1e-3, 0.0, -5e-4]), Effect(SCALE, 1): 4e-6, step: 2e-4}
     given, _ = lengths(errors, pucks=PUCKS[::50][:13], surveys=2)
     given.lengths_m[3, 5] = given.lengths_m[8, 0] = np.nan
@@ -86,6 +103,11 @@ def test_the_adjustment_is_the_dense_least_squares_solution_of_points_and_networ
                 away = np.linalg.norm(points[k] - COLLIMATORS[i] - values[Effect(COLLIMATOR, i)])
                 scale = values[Effect(SCALE, int(given.survey[k]))][0]
                 scale += values[Effect(DRIFT, int(given.survey[k]))][0] * given.hours[k]
+                if given.survey[k] == wave.of:
+                    own = given.hours[given.survey == wave.of]
+                    time = given.hours[k] / (own[-1] - own[0])
+                    scale -= values[wave][0] * np.cos(2.0 * np.pi * time)
+                    scale += values[wave][1] * (np.sin(3.0 * np.pi * time) + 8.0 / (3.0 * np.pi**2) * time)
                 length = away * (1.0 + scale) + values[Effect(OFFSET, i)][0]
                 length += values[step][0] if i == step.of and k >= step.since else 0.0
                 rows.append((given.lengths_m[k, i] - length) / given.sigmas_m[k, i])
@@ -182,6 +204,94 @@ def test_a_network_as_configured_is_consistent_also_with_more_noise(noise: float
         assert {one.kind for one in found.undetermined} >= {OFFSET}  # their priors are better than what the lengths say
 
 
+@pytest.mark.parametrize(("noise", "factor"), [(1.0, 3.0), (2.0, 10.0)])
+def test_a_noisy_channel_is_one_finding_and_keeps_its_lengths(noise: float, factor: float) -> None:
+    """And the points are as uncertain as they say."""
+    noises = noise * np.where(np.arange(CHANNELS) == 4, factor, 1.0)
+    given, points = lengths(NOTHING, noise=noises)
+    found = calibrate(given, CFG.etalon, CFG.align.network, CFG.align.false_alarm)
+    assert (found.state, found.findings) == (NetworkState.CONSISTENT, ())
+    assert (found.bad_lengths.sum(), found.bad_points.sum()) == (0, 0)
+    assert found.channel_noise == pytest.approx(noises, rel=0.2)  # of 174 lengths
+    assert np.flatnonzero(found.channel_noise > found.noise).tolist() == [4]
+    assert_uncertain_as_stated(found, points)
+
+
+def assert_uncertain_as_stated(found: NetworkResult, points: FloatArray) -> None:
+    """The errors of the points by their covariances."""
+    errors = found.adjustment.points_m - points
+    whole = found.adjustment.noise_m2 + found.adjustment.moves @ found.adjustment.covariance @ np.swapaxes(
+        found.adjustment.moves, 1, 2
+    )
+    nees = np.einsum("ka,kab,kb->k", errors, np.linalg.inv(whole), errors)
+    assert 1.0 < nees.mean() < 4.0  # 3 in the mean over networks; the points of one share its errors
+
+
+def test_wrong_lengths_of_a_channel_are_no_noise() -> None:
+    given, _ = lengths(NOTHING)
+    given.lengths_m[::20, 3] += 1e-4
+    found = calibrate(given, CFG.etalon, CFG.align.network, CFG.align.false_alarm)
+    assert np.flatnonzero(found.bad_lengths[:, 3]).tolist() == list(range(0, len(given.start_m), 20))
+    assert (found.channel_noise == found.noise).all()
+
+
+@pytest.mark.parametrize("period_min", [6.0, 25.0])
+def test_a_scale_that_oscillates_is_found_and_the_points_are_computed_with_it(period_min: float) -> None:
+    def wave(hours: FloatArray) -> FloatArray:
+        return np.asarray(3e-6 * np.sin(2.0 * np.pi * 60.0 * hours / period_min))
+
+    given, points = lengths(NOTHING, wave=wave, pucks=PUCKS[::2])
+    found = calibrate(given, CFG.etalon, CFG.align.network, CFG.align.false_alarm)
+    # The ends of the survey may be a step besides.
+    assert {VARIATION} <= {one.effect.kind for one in found.findings} <= {VARIATION, SCALE}
+    assert_uncertain_as_stated(found, points)
+    adjusted, truth = found.adjustment, wave(given.hours)
+    errors = adjusted.scale_design @ adjusted.values - truth
+    assert np.sqrt(np.mean(errors**2)) < 0.4 * np.sqrt(np.mean(truth**2))
+    points_of = tuple((PointId(1, 1, number), 10.0 * number) for number in range(len(points)))
+    own = RefinedSurvey((), CommonErrors({}, 0), 0)
+    told = CalibratedSurveys(found, M1.channels, (own,), points_of)
+    shortest, longest = map(int, re.findall(r"with periods of (\d+) to (\d+) minutes", sentence(told))[0])
+    assert shortest <= period_min <= longest
+    # Of a sine the rms is its amplitude over the square root of two.
+    (rms,) = re.findall(r"the scale of all lengths varies about its drift by (.*) ppm rms", sentence(told))
+    assert float(rms) == pytest.approx(3.0 / np.sqrt(2.0), rel=0.2)
+    assert sentence(told).count("scale") == 1
+    assert "a variation of the scale of " in air_text(told)
+    data = network_data(told)
+    assert data is not None
+    bands = [one["periods_min"] for one in data["findings"] if one["kind"] == "variation"]
+    assert any(low <= period_min <= high for low, high in bands)
+
+
+def test_panels_that_lie_in_waves_are_no_variation_of_the_scale() -> None:
+    """The points are free: what the mirror looks like changes nothing of the network."""
+    up = np.array(M1.rotate_world_from_deck((0.0, 0.0, 1.0)))
+    waves = 2e-4 * np.sin(2.0 * np.pi * np.arange(len(EVERY_FOURTH)) / 30.0)[:, None] * up
+    flat, wavy = (found_in(NOTHING, pucks=EVERY_FOURTH + one) for one in (0.0 * waves, waves))
+    for found in (flat, wavy):
+        assert (found.state, found.findings) == (NetworkState.CONSISTENT, ())
+    sigmas = np.sqrt(np.diag(flat.adjustment.covariance))
+    assert np.max(np.abs(flat.adjustment.values - wavy.adjustment.values) / sigmas) < 0.2
+
+
+def test_the_prior_of_a_band_is_the_mean_of_all_by_what_the_lengths_say() -> None:
+    rng = np.random.default_rng(4)
+    root: FloatArray = rng.normal(size=(5, 3)) * 1e6
+    information, wide = root.T @ root, 3e-6
+    sigmas: FloatArray = np.array([2e-6, 1e-6, 5e-7])
+    for size in (0.0, 5e-7, 2e-6):
+        seen = size * rng.normal(size=3)  # by the lengths alone
+        covariance = np.linalg.inv(information + np.eye(3) / wide**2)
+        chances = [
+            chance * multivariate_normal.pdf(seen, cov=np.linalg.inv(information) + sigma**2 * np.eye(3))
+            for chance, sigma in zip((0.7, 0.1, 0.1, 0.1), (0.0, *sigmas), strict=True)
+        ]
+        expected = np.sqrt(np.dot(chances[1:], sigmas**2) / sum(chances))
+        found = prior_of_many(covariance @ information @ seen, covariance, wide, sigmas, 0.3)
+        assert found == pytest.approx(expected, rel=1e-6)
+
+
 USUAL, MOVED = 1e-7, 5e-6
 
 
@@ -218,11 +328,7 @@ def test_the_points_of_a_changed_network_are_those_of_one_that_has_not() -> None
     given, points = lengths({Effect(COLLIMATOR, 4): MOVE, Effect(OFFSET, 2): 3e-4})
     found = calibrate(given, CFG.etalon, CFG.align.network, CFG.align.false_alarm)
     errors = found.adjustment.points_m - points
-    whole = found.adjustment.noise_m2 + found.adjustment.moves @ found.adjustment.covariance @ np.swapaxes(
-        found.adjustment.moves, 1, 2
-    )
-    nees = np.einsum("ka,kab,kb->k", errors, np.linalg.inv(whole), errors)
-    assert 1.0 < nees.mean() < 4.0  # 3 in the mean over networks; the points of one share its errors
+    assert_uncertain_as_stated(found, points)
     assert np.sqrt(np.mean(errors**2)) < 5e-6
 
 
@@ -357,6 +463,29 @@ def test_panels_are_right_within_their_sigmas_with_and_without_a_slipped_channel
     assert data is not None
     assert data["state"] == ("changed" if change is slipped else "consistent")
     assert len(data["effects"]) == 2 * CHANNELS + 2 + (change is slipped)
+
+
+def test_a_noisy_channel_is_named_with_its_factor_in_the_sentence_and_in_the_data() -> None:
+    rng = np.random.default_rng(6)
+
+    def noisy(_: int, some: dict[int, float]) -> dict[int, float]:
+        return some | {3: some[3] + 2e-5 * float(rng.normal())}
+
+    result, network = align_survey(CFG, M1, survey(noisy, LIES), PANELS)
+    assert network is not None
+    expected = (
+        re.escape("The laser network is consistent: 288 lengths, noise as configured, in channel 3 ") + r"(.*?) times"
+    )
+    (factor,) = re.findall(expected, sentence(network))
+    sigma_m = float(network.network.given.sigmas_m[:, M1.channels.index(3)].mean())
+    assert float(factor) == pytest.approx(np.hypot(1.0, 2e-5 / sigma_m), rel=0.4)  # by 36 lengths
+    assert "channel 3 have" in " ".join(remarks(network))
+    data = network_data(network)
+    assert data is not None
+    assert [one["channel"] for one in data["noisy_channels"]] == [3]
+    against = compare(result.panels, TRUTH)
+    assert against is not None
+    assert against.chi2 < against.high
 
 
 def test_a_network_that_bends_is_not_taken_for_panels_nor_the_other_way_round() -> None:
