@@ -282,7 +282,7 @@ def test_the_prior_of_a_band_is_the_mean_of_all_by_what_the_lengths_say() -> Non
     sigmas: FloatArray = np.array([2e-6, 1e-6, 5e-7])
     for size in (0.0, 5e-7, 2e-6):
         seen = size * rng.normal(size=3)  # by the lengths alone
-        covariance = np.linalg.inv(information + np.eye(3) / wide**2)
+        covariance = np.asarray(np.linalg.inv(information + np.eye(3) / wide**2), dtype=np.float64)
         chances = [
             chance * multivariate_normal.pdf(seen, cov=np.linalg.inv(information) + sigma**2 * np.eye(3))
             for chance, sigma in zip((0.7, 0.1, 0.1, 0.1), (0.0, *sigmas), strict=True)
