@@ -147,7 +147,8 @@ def follow(
 
     ``finest_s``: steps of odometry within an interval of this length are combined, but cut at each reading.
     """
-    if not np.isfinite(run.readings.range_m).any():  # levels are too coarse to tell the place of the antenna
+    # Levels are too coarse to tell the place of the antenna; of several radios each would have an error of its own.
+    if run.tags or not np.isfinite(run.readings.range_m).any():
         cfg = cfg.model_copy(update={"priors": cfg.priors.model_copy(update=dict.fromkeys(ANTENNA, 0.0))})
     sigmas = cfg.priors.pose_m, cfg.priors.pose_m, cfg.priors.heading_rad
     window = None if lag is None else Window(run, cfg, how, lag)
