@@ -145,7 +145,10 @@ def test_the_weight_of_a_prior_converges_in_one_solution(value: float, sigma: fl
 
 def test_its_ellipses_contain_the_truth_where_neither_heights_nor_the_antenna_are_known() -> None:
     run = trait_run(("heights",), 0)
-    track = estimated(run, Settings(CONFIG.csv, CONFIG.filter), CONFIG.fixed_lag)
+    given = Settings(CONFIG.csv, CONFIG.filter).but(
+        priors__beacon_height_m2=4.0, priors__antenna_ahead_m=0.1, priors__antenna_left_m=0.1
+    )
+    track = estimated(run, given, CONFIG.fixed_lag)
     found = judge(track, run).nees
     assert found is not None
     assert found.mean < 2.0
