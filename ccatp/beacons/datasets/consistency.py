@@ -277,7 +277,7 @@ def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
         yield off
         return
     if not windows.is_pointed:
-        yield from _above(*windows.heights_m2(times_s, path))
+        yield from _above(*windows.heights_m2(times_s, path), run.kind)
     middle_s = float(np.median(windows.begin_s))
     parts = [np.ones(windows.count, dtype=bool), windows.begin_s < middle_s, windows.begin_s >= middle_s]
     lags = _lags(lambda lag_s: windows.misfits(times_s, path, lag_s), parts)
@@ -299,14 +299,15 @@ def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
                 yield f"ranges fit an odometry that turns {factor:.3g} times as much: are its turns in {what}?"
 
 
-def _above(squares_m2: FloatArray, sigmas_m2: FloatArray) -> Iterator[str]:
+def _above(squares_m2: FloatArray, sigmas_m2: FloatArray, kind: str) -> Iterator[str]:
     if (
         np.mean(squares_m2 > 2.0 * sigmas_m2) > MAJORITY
         and (usual_m2 := float(np.median(squares_m2))) > LEAST_HEIGHT_M**2
     ):
         yield (
             f"ranges are as those of beacons about {np.sqrt(usual_m2):.1g} m above or below the radio, or too long: "
-            "give the heights of the beacons (z) and of the antenna, or a prior of the offset"
+            f"give the heights of the beacons (z) and of the antenna, or priors: {kind}.priors.beacon_height_m2=4, or of "
+            "the offset"
         )
 
 
