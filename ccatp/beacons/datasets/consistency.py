@@ -306,8 +306,8 @@ def _above(squares_m2: FloatArray, sigmas_m2: FloatArray, kind: str) -> Iterator
     ):
         yield (
             f"ranges are as those of beacons about {np.sqrt(usual_m2):.1g} m above or below the radio, or too long: "
-            f"give the heights of the beacons (z) and of the antenna, or priors: {kind}.priors.beacon_height_m2=4, or of "
-            "the offset"
+            "give the heights of the beacons (z) and of the antenna, or a prior of their squares "
+            f"({kind}.priors.beacon_height_m2=4) or of the offset"
         )
 
 
