@@ -62,6 +62,7 @@ def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) 
     _check_steps(odometry)
     steps = bridged(Steps(odometry.values[:, 0], *(odometry.values[1:, column] for column in (1, 2, 3))))
     readings, beacon_ids = _readings(recording, tables, steps, warnings)
+    readings = _without_lone_levels(readings, beacon_ids, warnings)
     if unheard := [name for name in known.moving if name not in beacon_ids]:
         raise RadioDataError(
             file, f"has no reading of beacon {unheard[0]}, which is to move; there are {listed(beacon_ids)}"
@@ -234,6 +235,18 @@ def _readings(
     range_m, bearing_rad, rssi_dbm = data.T.copy()
     readings = Readings(times_s, index.astype(np.int64), range_m, bearing_rad, rssi_dbm, tag.astype(np.int64))
     return readings, tuple(recording.names[int(who)] for who in beacons)
+
+
+def _without_lone_levels(readings: Readings, names: tuple[str, ...], warnings: list[str]) -> Readings:
+    """Without levels of a beacon that has ranges at other times: an estimate has one measure of distance a beacon."""
+    ranged = np.isfinite(readings.range_m)
+    lone = np.isin(readings.beacon, np.unique(readings.beacon[ranged])) & ~ranged & np.isfinite(readings.rssi_dbm)
+    if not lone.any():
+        return readings
+    whose = listed([names[k] for k in np.unique(readings.beacon[lone]).tolist()])
+    warnings.append(f"{plural(int(lone.sum()), 'signal strength')} of {whose} not used: their beacons have ranges, too")
+    readings = readings._replace(rssi_dbm=np.where(lone, np.nan, readings.rssi_dbm))
+    return readings.where(~lone | np.isfinite(readings.bearing_rad))
 
 
 def _check_names(recording: Recording, beacons: list[int]) -> None:

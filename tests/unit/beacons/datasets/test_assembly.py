@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.datasets.ordering import clock_sets
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.estimation.recording import RecordedRun, dead_reckoned
+from ccatp.beacons.studies.recordings import estimate
 from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, world, write_lines
 
 W = world(seconds=60.0)
@@ -383,3 +385,19 @@ def test_a_check_that_fails_is_a_warning(tmp_path: Path, monkeypatch: pytest.Mon
     run, said = read(tmp_path, list)
     assert "the check of fail cannot be made on these data (expected non-empty vector)" in said
     assert run.readings.range_m.size == W.range_m.size
+
+
+def test_of_a_beacon_with_ranges_the_levels_at_other_times_are_left_out(tmp_path: Path) -> None:
+    """An estimator took a beacon's level for a range."""
+
+    def heard_twice(lines: list[str]) -> list[str]:
+        k = next(k for k, line in enumerate(lines) if line.startswith("range,") and float(line.split(",")[1]) > 20.0)
+        _, at_s, name, *_ = lines[k].split(",")
+        return [*lines[:k], f"rssi,{float(at_s) - 0.004:.3f},{name},-60.0", f"rssi,{at_s},{name},-60.0", *lines[k:]]
+
+    whole, (run, said) = read(tmp_path, list)[0], read(tmp_path, heard_twice)
+    assert "1 signal strength of" in said
+    assert "not used: their beacons have ranges, too" in said
+    assert len(run.readings.times_s) == len(whole.readings.times_s)
+    assert np.isfinite(run.readings.rssi_dbm).sum() == 1  # the one beside a range
+    assert estimate(run, load_recordings_config(), "ekf-slam").beacons.keys() == set(run.beacon_ids)
