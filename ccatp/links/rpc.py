@@ -222,7 +222,7 @@ def request(
             if peer.poll(max(1, round(period_s * 1000.0))):
                 break
             if has_ended() and not peer.poll(0):
-                raise RequestFailed(f"{endpoint}: ccatp ended before it answered; ccatp runs show tells how")
+                raise RequestFailed(f"{endpoint}: ccatp ended before it answered; see ccatp runs show")
         else:
             there = "" if curve is None else " there, with this server key and you listed"
             raise RequestFailed(f"no answer from {endpoint} within {timeout_s:g} s: is ccatp running{there}?")

@@ -13,7 +13,7 @@ from ccatp.beacons.config.models import FixedLagConfig, PriorsConfig, RecordingC
 from ccatp.beacons.estimation.batch_problem import BeaconNoise
 from ccatp.beacons.estimation.beacon_map import HEADING
 from ccatp.beacons.estimation.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
-from ccatp.beacons.estimation.measurement_models import ANTENNA
+from ccatp.beacons.estimation.measurement_models import ANTENNA, HEIGHT_M2
 from ccatp.beacons.estimation.motion import POSE, Increment
 from ccatp.beacons.estimation.odometry_noise import OdometryNoise
 from ccatp.beacons.estimation.recording import (
@@ -38,7 +38,7 @@ UNCHANGED = 0.999  # share of the prior's standard deviation above which a value
 def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, float], kind: str) -> Iterator[str]:
     """A warning for each value that is more than FAR standard deviations from zero, the mean of its prior."""
     for name, (value, _) in calibration.items():
-        key = name.split()[0]  # the name of a beacon follows
+        key = name if name in priors else HEIGHT_M2  # of one beacon
         sigma = priors[key]
         if abs(value) > FAR * sigma:
             yield (
@@ -232,8 +232,12 @@ def _result(
     # Only values that the readings have determined at least in part.
     calibration = {
         name: Calibrated(*found)
-        for name, found in (slam.calibration | slam.heights).items()
-        if found[1] < UNCHANGED * getattr(assumed, name.split()[0])
+        for name, found in slam.calibration.items()
+        if found[1] < UNCHANGED * getattr(assumed, name)
+    } | {
+        name: Calibrated(*found)
+        for name, found in slam.heights.items()
+        if found[1] < UNCHANGED * assumed.beacon_height_m2
     }
     beacons, none = [(name, fix) for name, fix in slam.beacons.items() if name not in slam.walks_m2_s], np.empty(0)
     for name, until_s, fix in slam.left:

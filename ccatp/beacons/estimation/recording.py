@@ -144,7 +144,7 @@ class RecordedRun:
 
     @property
     def raised(self) -> BoolArray:
-        """Whether the height of a beacon over the antenna may be told by its ranges, shape (b,): not over several."""
+        """Whether ranges can determine the heights of beacons over the antenna, shape (b,): not over several."""
         r, found = self.readings, np.array([name not in self.levelled for name in self.beacon_ids], dtype=bool)
         found[r.beacon[np.isnan(r.range_m) & np.isfinite(r.rssi_dbm)]] = False  # placed by levels
         return found & (not self.tags)
