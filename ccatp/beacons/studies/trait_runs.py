@@ -25,6 +25,7 @@ LONG_S = 150.0
 FINE_S = 0.005  # of the true motion
 _ODOMETRY_S = 0.1
 _OUTLIERS, _OUTLYING_M = 0.009, 5.0
+_FIRST_POSE = (0.05, 0.05, 0.05)  # standard deviations of its error: x and y, m; heading, rad
 _TICK_M, _TICK_RAD = 1e-3, 2e-3  # of the odometry at 200 Hz
 
 
@@ -42,7 +43,8 @@ class _Motion:
 def trait_run(traits: Collection[str], seed: int) -> RecordedRun:
     """A run of two and a half minutes in a room of 8 to 25 m with some of ``TRAITS``; the same for equal arguments.
 
-    Noise and calibration errors without a trait are drawn within those of the format ``csv`` of recordings.toml.
+    Noise and calibration errors without a trait are drawn within those of the format ``csv`` of recordings.toml. The
+    first pose differs from the truth as its prior there says, or a consistent covariance would be too large.
     Raises ValueError: there is no such trait.
     """
     for name in traits:
@@ -54,7 +56,7 @@ def trait_run(traits: Collection[str], seed: int) -> RecordedRun:
     steps = _odometry(motion, rng, traits)
     places_m = _placed(room_m, rng, traits)
     readings = _ranges(motion, places_m, rng, traits)
-    x_m, y_m, heading_rad = motion.poses[0].tolist()
+    x_m, y_m, heading_rad = (motion.poses[0] + rng.normal(0.0, _FIRST_POSE)).tolist()
     names = tuple(f"b{k}" for k in range(len(places_m)))
     shown = slice(None, None, round(_ODOMETRY_S / FINE_S))
     return RecordedRun(

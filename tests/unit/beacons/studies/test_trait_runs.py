@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.estimation.evaluation import truth_at
 from ccatp.beacons.estimation.recording import RecordedRun
 from ccatp.beacons.studies.trait_runs import TRAITS, trait_run
@@ -62,3 +63,15 @@ def test_equal_arguments_give_equal_runs_and_other_seeds_other_ones() -> None:
     )
     assert np.all(np.diff(PLAIN.readings.times_s) > 0.0)
     assert np.all(np.diff(PLAIN.steps.times_s) > 0.0)
+
+
+def test_first_poses_differ_from_the_truth_as_their_prior_says() -> None:
+    off = []
+    for seed in range(40):
+        run = trait_run(("single",), seed)
+        assert run.truth is not None
+        off.append(np.subtract(run.first_pose, [column[0] for column in run.truth[1:]]))
+    prior = load_recordings_config().csv.priors
+    sigmas = np.array([prior.pose_m, prior.pose_m, prior.heading_rad])
+    shares = np.mean(np.square(off / sigmas), axis=0)
+    assert np.all((shares > 0.5) & (shares < 1.7))  # chi-square of 40: 0.52 to 1.66 in 99.8 %
