@@ -180,6 +180,8 @@ class Timeline:
         self.missing = self._count_missing()
         self._shifts = self._track_shifts(found)
         self._utc = self._anchors(found, is_simulation=is_simulation)
+        self._utc_s = np.array([at_s for at_s, _ in self._utc])
+        self._utc_past_ns = np.array([zero_ns - self._utc[0][1] for _, zero_ns in self._utc], dtype=np.float64)
         self.notes = tuple(self._say(is_inferred=not found.sessions))
 
     @property
@@ -252,6 +254,9 @@ class Timeline:
 
     def at(self, number: int) -> float:
         """Mission time of a frame, s."""
+        at = int(self.number.searchsorted(number))
+        if at < len(self.number) and self.number[at] == number:
+            return float(self.t_s[at])
         return float(self.times(np.array([number], dtype=np.float64))[0])
 
     def times(self, numbers: IntArray | FloatArray) -> FloatArray:
@@ -267,7 +272,7 @@ class Timeline:
 
         A sample from before a step of the clock still has the time of before it.
         """
-        at = int(np.searchsorted(self.number, number))
+        at = int(self.number.searchsorted(number))
         now_s = self.at(number)
         own_s = now_s + (sample_s - frame_s)
         if not -OLDEST_SAMPLE_S <= own_s - now_s <= ROUNDING_S:
@@ -286,9 +291,8 @@ class Timeline:
             return None
         if len(self._utc) == 1:
             return round(t_s * _NS) + self._utc[0][1]
-        times_s, zeros_ns = [at_s for at_s, _ in self._utc], [zero_ns for _, zero_ns in self._utc]
-        past_ns = np.interp(t_s, times_s, [zero_ns - zeros_ns[0] for zero_ns in zeros_ns])
-        return round(t_s * _NS) + zeros_ns[0] + round(float(past_ns))
+        past_ns = np.interp(t_s, self._utc_s, self._utc_past_ns)
+        return round(t_s * _NS) + self._utc[0][1] + round(float(past_ns))
 
     # -- messages on the axis -------------------------------------------------------------------------------------
 
