@@ -40,10 +40,27 @@ def judge(
     assert not wrong, json.dumps(wrong, indent=1)
 
 
+# Further units of one quantity: as the first one, a factor beyond the limits of its check.
+FURTHER = {
+    "encoders in degrees", "encoders in turns per second", "encoders of the motor's shaft", "drives taken for degrees",
+    "gyroscope in turns per second", "gyroscope that is dead", "accelerometer in mm/s2", "accelerometer that is dead",
+}  # fmt: skip
+FIRST_UNITS = [broken for broken in QUANTITIES if broken.name not in FURTHER]
+FURTHER_UNITS = [broken for broken in QUANTITIES if broken.name in FURTHER]
+
+
 @pytest.mark.parametrize(
     "table",
-    [SESSIONS, STREAMS, COMMANDS, STEPS, QUANTITIES, RULES, UNSEEN],
-    ids=["sessions", "frames", "commands", "steps", "quantities", "rules", "unseen"],
+    [
+        pytest.param(SESSIONS, id="sessions"),
+        pytest.param(STREAMS, id="frames"),
+        pytest.param(COMMANDS, id="commands"),
+        pytest.param(STEPS, id="steps"),
+        pytest.param(FIRST_UNITS, id="quantities"),
+        pytest.param(FURTHER_UNITS, id="further quantities", marks=pytest.mark.slow),
+        pytest.param(RULES, id="rules"),
+        pytest.param(UNSEEN, id="unseen"),
+    ],
 )
 def test_in_lockstep(config: Config, table: list[Defect], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_checks, "FRAMES", 15)  # whatever is wrong with them is wrong with the first
@@ -70,4 +87,5 @@ def test_every_check_has_its_broken_server() -> None:
     seeded = [broken for table in TABLES.values() for broken in table]
     found = {name for broken in seeded for name in broken.fails.split()}
     assert set(IDS) - found == {"mac"}  # a server that refuses the right mac lets no check begin
+    assert len(FURTHER_UNITS) == len(FURTHER)
     assert sum(bool(broken.fails) for broken in seeded) > 0.95 * len(seeded) > 60

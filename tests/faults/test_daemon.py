@@ -27,6 +27,7 @@ from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.survey.events import Pause, Resume
 from tests.faults.linking import Measured
+from tests.support.cases import slow_case
 from tests.support.daemon import Daemon, configuration, running_daemon, tell
 from tests.support.scenario import SurveyLoop, begin
 
@@ -263,7 +264,7 @@ async def test_a_robot_whose_clock_is_wrong_by_a_hundredth_is_not_late(rate: flo
 
 
 @pytest.mark.fault("S12")
-@pytest.mark.parametrize("by_s", [5.0, -3.0])
+@pytest.mark.parametrize("by_s", [slow_case(5.0), -3.0])
 async def test_it_drives_on_by_verdicts_of_the_new_time_after_the_robots_clock_has_jumped(by_s: float) -> None:
     offset_s = 0.0
 

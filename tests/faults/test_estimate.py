@@ -20,6 +20,7 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.events import FixStored, Mode
 from tests.faults.linking import Measured
+from tests.support.cases import slow_case
 from tests.support.scenario import config_of, one_panel
 from tests.support.sim_survey import MeasuredSurvey, RestartedSurvey
 
@@ -168,7 +169,7 @@ def check(rehearsal: RestartedSurvey) -> None:
 
 
 @pytest.mark.fault("P17")
-@pytest.mark.parametrize("seed", [2, 5])
+@pytest.mark.parametrize("seed", [slow_case(2), 5])
 def test_killed_while_turning_and_driving(seed: int) -> None:
     rehearsal = RestartedSurvey(restarted(seed, mission__calibration_length_m=0.0), {350, 1480})
     check(rehearsal)

@@ -1,12 +1,13 @@
 """Frames go on, but their samples do not support the pose: the robot stands, is located by a fix, and continues."""
 
-from itertools import pairwise, product
+from itertools import pairwise
 
 import pytest
 
 from ccatp.core import Severity
 from ccatp.survey.events import Mode
 from tests.faults.linking import Measured
+from tests.support.cases import slow_case
 from tests.support.scenario import one_panel
 from tests.support.sim_survey import Seen, watched
 
@@ -44,9 +45,19 @@ def has_measured(seen: list[Seen]) -> bool:
 
 
 @pytest.mark.fault("S30")
-@pytest.mark.parametrize("for_s", [0.5, 1.9])
-@pytest.mark.parametrize("at_s", [DRIVING_S, TURNING_S])
-@pytest.mark.parametrize("silent", SILENT)
+@pytest.mark.parametrize(
+    ("silent", "at_s", "for_s"),
+    [
+        ("all", DRIVING_S, 1.9),
+        ("all", TURNING_S, 0.5),
+        ("encoders and edges", DRIVING_S, 0.5),
+        ("encoders and edges", TURNING_S, 1.9),
+        slow_case("all", DRIVING_S, 0.5),
+        slow_case("all", TURNING_S, 1.9),
+        slow_case("encoders and edges", DRIVING_S, 1.9),
+        slow_case("encoders and edges", TURNING_S, 0.5),
+    ],
+)
 def test_after_a_gap_of_samples_the_robot_is_located_before_it_moves(
     silent: str, at_s: float, for_s: float, measured: Measured
 ) -> None:
@@ -56,7 +67,10 @@ def test_after_a_gap_of_samples_the_robot_is_located_before_it_moves(
 
 
 @pytest.mark.fault("S31")
-@pytest.mark.parametrize(("by_s", "at_s"), [*product((-5.0, 0.4), (DRIVING_S, TURNING_S))])
+@pytest.mark.parametrize(
+    ("by_s", "at_s"),
+    [(-5.0, DRIVING_S), (0.4, TURNING_S), slow_case(-5.0, TURNING_S), slow_case(0.4, DRIVING_S)],
+)
 def test_samples_of_impossible_times_are_a_gap(by_s: float, at_s: float, measured: Measured) -> None:
     clocks = (f"{sensor}_clock jump by_s={by_s}" for sensor in ("encoder", "edge"))
     worst_mm = worst_arrival_mm(at_s, 1.9, *clocks)
@@ -67,7 +81,13 @@ def test_samples_of_impossible_times_are_a_gap(by_s: float, at_s: float, measure
 @pytest.mark.fault("F11")
 @pytest.mark.parametrize(
     ("factor", "signals"),
-    [*product((0.5, 0.75, 1.25, 1.5), [("right_wheel", "left_wheel")]), (1.25, ("left_wheel",))],
+    [
+        (0.75, ("right_wheel", "left_wheel")),
+        (1.25, ("right_wheel", "left_wheel")),
+        (1.25, ("left_wheel",)),
+        slow_case(0.5, ("right_wheel", "left_wheel")),
+        slow_case(1.5, ("right_wheel", "left_wheel")),
+    ],
 )
 def test_wheels_that_turn_at_a_wrong_multiple_are_held(
     factor: float, signals: tuple[str, ...], measured: Measured

@@ -328,7 +328,7 @@ def test_a_puck_off_the_surface_is_refused(height_m: float, is_taken: bool, tmp_
 @pytest.mark.parametrize(
     "way",
     [
-        (0.03, 0.0, 0.0),
+        pytest.param((0.03, 0.0, 0.0), marks=pytest.mark.slow),
         pytest.param((0.0, -0.06, 0.0), marks=pytest.mark.slow),
         (0.1, 0.1, 0.2),
     ],

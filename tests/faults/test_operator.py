@@ -46,6 +46,7 @@ from ccatp.survey.events import (
 from ccatp.survey.planning.route import RoutePlanner
 from ccatp.survey.planning.search import path_time
 from tests.faults.linking import Measured
+from tests.support.cases import slow_case
 from tests.support.mission_story import DT, FREE, FRONT_OFF, Story, from_first_leg
 from tests.support.scenario import config_of, mirror_of, one_panel
 from tests.support.sim_survey import FULL, MeasuredSurvey, plan_of
@@ -112,7 +113,7 @@ def test_a_fire_stops_the_wheels_and_leads_home(state: Mode, tmp_path: Path, mea
 
 
 @pytest.mark.fault("O1")
-@pytest.mark.parametrize("state", [DRIVING, TURNING])
+@pytest.mark.parametrize("state", [DRIVING, slow_case(TURNING)])
 def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
     state: Mode, tmp_path: Path, measured: Measured
 ) -> None:
