@@ -109,6 +109,7 @@ class _Export:
         self._cfg, self._mirror, self._covariances, self._motions = cfg, mirror, covariances, motions
         self._timeline, self._left_out = timeline, 0
         self._newest = -1  # number of the newest frame that is written
+        self._stamped_s, self._stamp_ns = nan, 0  # the last time that was asked for, and its stamp
 
     def messages(self, recording: Recording) -> Iterator[tuple[str, int, Any]]:
         """Topic, stamp (ns) and message, in the order of recording."""
@@ -139,8 +140,10 @@ class _Export:
             recording.warnings.append(f"{recording.path}: {what}")
 
     def _ns(self, t_s: float) -> int:
-        utc_ns = self._timeline.utc_ns(t_s)
-        return round(t_s * _NS) if utc_ns is None else utc_ns
+        if t_s != self._stamped_s:  # a message and its header have one time
+            utc_ns = self._timeline.utc_ns(t_s)
+            self._stamped_s, self._stamp_ns = t_s, round(t_s * _NS) if utc_ns is None else utc_ns
+        return self._stamp_ns
 
     def _header(self, t_s: float, frame: str) -> Any:
         return ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(*divmod(self._ns(t_s), _NS)), frame)

@@ -16,9 +16,12 @@ from ccatp.core import DeckPose, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.route import ORDERS, RoutePlanner, thesis_order
 from ccatp.survey.planning.search import path_time
+from tests.support.cases import slow_case
 from tests.support.scenario import config_of, mirror_of
 
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
+# A primary and a secondary mirror, one of each size; the other two are tried by the slow tests.
+ONE_OF_EACH = [slow_case("fyst-m1"), "fyst-m2", "thesis-m1", slow_case("thesis-m2")]
 ROUNDING_M = 1e-8  # the rim's segment clearance is exact to 1 nm
 # The planner looks along each turn in steps of one degree and allows 10 um for what lies between; so do we.
 SWEEP_M = 1e-5
@@ -180,7 +183,7 @@ def test_home_from_the_end_of_a_survey(name: str, order: str, panels: int) -> No
 
 
 @pytest.mark.parametrize(("inner", "rim"), [(96, 9), pytest.param(24, 1, marks=pytest.mark.slow, id="all")])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_home_from_points(name: str, inner: int, rim: int) -> None:
     """From every so many of the points, and of those at the rim."""
     cfg, mirror = load(name)
@@ -191,7 +194,7 @@ def test_home_from_points(name: str, inner: int, rim: int) -> None:
 
 
 @pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow, id="all")])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_home_from_a_point_at_the_rim_without_a_sweep(name: str, step: int) -> None:
     """As a survey stands there, along the rim or across it, no sensor comes nearer to it than on a survey."""
     cfg, mirror = load(name)

@@ -10,6 +10,7 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.studies.sil_run import rehearse
 from ccatp.survey.forecast import TimeForecast, forecast_time
 from ccatp.survey.planning.route import ORDERS, plan_survey
+from tests.support.cases import slow_case
 
 
 @cache
@@ -22,7 +23,7 @@ def forecast(**settings: Any) -> TimeForecast:
 # Means of twenty whole surveys, and the range of those of the optimised order: docs/measurements/results.md.
 @pytest.mark.parametrize(
     ("world", "order", "least_s", "most_s"),
-    [("hard", "thesis", 3730, 3730), ("extreme", "thesis", 3836, 3836), ("hard", "optimised", 2900, 3100)],
+    [("hard", "thesis", 3730, 3730), slow_case("extreme", "thesis", 3836, 3836), ("hard", "optimised", 2900, 3100)],
 )
 def test_it_is_near_what_whole_surveys_took(world: str, order: str, least_s: float, most_s: float) -> None:
     found = forecast(mirror="thesis-m1", world=world, order=order)
