@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import pytest
 
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RadioConfig
@@ -36,6 +37,7 @@ from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.events import Abort, Mode
 from ccatp.survey.route_follower import StateEstimate
+from tests.support.runs import made_once
 from tests.support.sim_survey import MeasuredSurvey
 
 HERE = DeckPose(0.0, 0.0, 0.0)
@@ -185,6 +187,11 @@ def record(run_dir: Path, *, is_simulation: bool = True, only: int | None = None
     settings = {"run.panels": 1, "run.world": "hard", "mission.calibration_length_m": 0.0}
     settings |= {key.replace("__", "."): value for key, value in changes.items()}
     return RecordingRun(load_config(overrides=settings), run_dir, is_simulation=is_simulation, only=only).leave()
+
+
+def record_surveyed(factory: pytest.TempPathFactory) -> Path:
+    """``record`` as it is, complete: made by the first worker that wants it. Not to be written to."""
+    return made_once(factory, "surveyed", lambda folder: record(folder / "tonight")) / "tonight"
 
 
 # -- missions among beacons --------------------------------------------------------------------------------------------

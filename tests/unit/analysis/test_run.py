@@ -20,13 +20,13 @@ from ccatp.daemon.operator.alarms import ALARMS_FILE
 from ccatp.links.runtime_dir import RUN_LOCK, locked
 from ccatp.records.recorder import read_metadata
 from ccatp.records.run_reader import RunReadError, open_recordings
-from tests.support.recorded import FRAMES, OFF_M, record, record_beacons
+from tests.support.recorded import FRAMES, OFF_M, record_beacons, record_surveyed
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One panel in a hard world, complete. Not to be written to."""
-    return record(tmp_path_factory.mktemp("recorded") / "tonight")
+    return record_surveyed(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

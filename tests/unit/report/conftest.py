@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.pages import drawn, undrawn
-from tests.support.recorded import record
-from tests.support.runs import made_once
+from tests.support.recorded import record_surveyed
 
 __all__ = ["drawn", "undrawn"]
 
@@ -16,7 +15,7 @@ __all__ = ["drawn", "undrawn"]
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One panel in a hard world, complete; recorded once per session for all workers. Not to be written to."""
-    return made_once(tmp_path_factory, "surveyed", lambda folder: record(folder / "tonight")) / "tonight"
+    return record_surveyed(tmp_path_factory)
 
 
 @pytest.fixture
