@@ -143,7 +143,7 @@ class BeaconSlam:
         self._learns = how.learn_memory > 0.0
         self._fresh = AddedPoseNoise()
         self._gate, self._knee, self._iterations = gate, how.knee_sigmas, iterations
-        self._refused, self.jumps, self.unplaced = 0, 0, 0
+        self.refused_in_a_row, self.jumps, self.unplaced = 0, 0, 0
         self.moved: list[tuple[BeaconId, float]] = []
         self.left: list[tuple[BeaconId, float, BeaconEstimate]] = []
         self.walks_m2_s: dict[BeaconId, float] = {}
@@ -487,7 +487,7 @@ class BeaconSlam:
 
     def _judge(self, reading: Reading, entry: MapEntry, *, accepted: bool) -> None:
         if accepted:
-            entry.refused = self._refused = 0
+            entry.refused = self.refused_in_a_row = 0
             if entry.on_trial:
                 entry.on_trial -= 1
             return
@@ -495,9 +495,9 @@ class BeaconSlam:
             self._map.leave(reading.beacon)
             return
         entry.refused += 1
-        self._refused += 1
-        if self._refused >= self._how.doubt_pose_after:
-            self._refused = 0
+        self.refused_in_a_row += 1
+        if self.refused_in_a_row >= self._how.doubt_pose_after:
+            self.refused_in_a_row = 0
             v = self.engine.vehicle_size
             jump = np.zeros(v)
             jump[:POSE] = self._how.jump_m, self._how.jump_m, self._how.jump_rad

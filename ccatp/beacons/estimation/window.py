@@ -121,6 +121,7 @@ class Window:
     def __init__(self, run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, lag: FixedLagConfig) -> None:
         self._run, self._lag, self._spacing_s = run, lag, lag.lag_s / lag.poses
         self._rest = how.rest_speed_m_s, how.rest_turn_rad_s
+        self._doubtful = how.doubt_pose_after - 1  # refusals in a row
         self._stands = np.array([name not in run.moving for name in run.beacon_ids])  # others are the filter's alone
         readings = run.readings.with_distances(cfg.radio.camera_field_rad)
         self._readings = readings.where(self._stands[readings.beacon])
@@ -158,7 +159,9 @@ class Window:
         placed = frozenset(map(str, slam.beacons)) - {*self._run.moving}
         joins = not placed <= self._placed or bool(slam.likely().keys() - {*self._run.moving})
         self._solved_s = time_s if joins or not placed else self._solved_s
-        if joins or (placed and time_s >= self._due_s):
+        # Refused readings may be good ones, linearised where the filter was too far off: solve before it doubts its pose.
+        is_doubtful = slam.refused_in_a_row >= self._doubtful
+        if joins or (placed and (time_s >= self._due_s or is_doubtful)):
             self.solve(time_s, slam, times_s, poses)
             self._placed = frozenset(map(str, slam.beacons)) - {*self._run.moving}
 
