@@ -159,7 +159,7 @@ class Window:
         placed = frozenset(map(str, slam.beacons)) - {*self._run.moving}
         joins = not placed <= self._placed or bool(slam.likely().keys() - {*self._run.moving})
         self._solved_s = time_s if joins or not placed else self._solved_s
-        # Refused readings may be good ones, linearised where the filter was too far off: solve before it doubts its pose.
+        # Refused readings may be good ones, linearised too far off: solve before the filter doubts its pose.
         is_doubtful = slam.refused_in_a_row >= self._doubtful
         if joins or (placed and (time_s >= self._due_s or is_doubtful)):
             self.solve(time_s, slam, times_s, poses)
