@@ -119,9 +119,12 @@ def faults(tree: ast.AST) -> Iterator[str]:
 
 def test_no_module_makes_code_of_data() -> None:
     found = {}
+    words = re.compile(rf"\b({'|'.join(MODULES | POOLS | CALLS | SWITCHES | METHODS)})\b")
     for path in PACKAGE.rglob("*.py"):
-        name = path.relative_to(PACKAGE).as_posix()
-        names = set(faults(ast.parse(path.read_text(encoding="utf-8"))))
+        text, name = path.read_text(encoding="utf-8"), path.relative_to(PACKAGE).as_posix()
+        if not words.search(text):
+            continue  # to parse every module takes seconds
+        names = set(faults(ast.parse(text)))
         if name in WITH_POOLS:
             names = {fault for fault in names if fault.split(".")[0] not in POOLS}
         if names:
