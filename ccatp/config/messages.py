@@ -7,7 +7,7 @@ import re
 import tomllib
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple, get_args
 
 from pydantic import BaseModel
@@ -49,6 +49,19 @@ class ConfigProblem(NamedTuple):
 
 def parse_toml(text: str, name: str) -> dict[str, Any]:
     """The content of the TOML file of that name; raises ConfigError, with the line, where it is not TOML."""
+    tree: dict[str, Any] = _copied(_parsed(text, name))
+    return tree
+
+
+def _copied(node: Any) -> Any:
+    """A tree of tables and arrays of its own."""
+    if isinstance(node, dict):
+        return {key: _copied(value) for key, value in node.items()}
+    return [_copied(value) for value in node] if isinstance(node, list) else node
+
+
+@lru_cache(maxsize=32)  # every configuration begins with the same shipped files, whose parsing is most of its loading
+def _parsed(text: str, name: str) -> dict[str, Any]:
     if deep := _MANY_PARTS.search(text):
         line = text.count("\n", 0, deep.start()) + 1
         raise ConfigError(f"{name}:{line}: a key has more than {MOST_PARTS} parts; no key of ccatp has half as many")

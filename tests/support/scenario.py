@@ -43,7 +43,7 @@ _LOADED: dict[str, Any] = {}
 
 
 def _loaded(load: Callable[[None, dict[str, object]], C], first: dict[str, object], overrides: dict[str, Any]) -> C:
-    """A configuration; it is frozen, so the same settings give the same object: to load one takes 10 to 20 ms."""
+    """A configuration; it is frozen, so the same settings give the same object: to load one takes 5 ms."""
     settings = first | {key.replace("__", "."): value for key, value in overrides.items()}
     key = f"{load.__name__} {settings!r}"
     if key not in _LOADED:

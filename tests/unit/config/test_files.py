@@ -13,6 +13,7 @@ import pytest
 from ccatp.beacons.datasets.tables import LONGEST_ROW, MOST_DATA_BYTES
 from ccatp.config.files import MOST_BYTES, keep_traceback, read_text
 from ccatp.config.load import load_config
+from ccatp.config.messages import parse_toml
 from ccatp.config.package import child_environment
 from ccatp.errors import LONGEST_LINE, CcatpError, ConfigError, one_line
 from tests.support.command import refused
@@ -99,6 +100,16 @@ def test_contents_of_a_configuration(content: str, tmp_path: Path) -> None:
     assert len(caught.value.problems) <= 11
     assert max(map(len, caught.value.problems)) <= LONGEST_LINE
     assert all(problem.isprintable() for problem in caught.value.problems)
+
+
+def test_a_text_that_is_parsed_again_is_a_tree_of_its_own() -> None:
+    text, tree = "[[a]]\nb = [1, {c = 2}]\n", {"a": [{"b": [1, {"c": 2}]}]}
+    changed = parse_toml(text, "file")
+    changed["a"][0]["b"][1]["c"] = 3
+    changed["a"][0]["b"].append(4)
+    changed["a"].append({})
+    changed["d"] = 5
+    assert parse_toml(text, "file") == tree
 
 
 def test_a_byte_order_mark_is_no_part_of_a_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
