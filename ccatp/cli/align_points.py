@@ -19,6 +19,7 @@ from ccatp.mirror.foreign_points import (
     Fitted,
     ForeignPoint,
     Frame,
+    OffHeight,
     PointsError,
     assign,
     common_figure,
@@ -32,6 +33,7 @@ from ccatp.mirror.point_file import Reading, is_of_coordinate, parse_points
 from ccatp.records.run_reader import CONFIG, check_run_dir
 
 _MOST_BYTES = 1 << 24  # a hundred readings of each of 783 points are 5 MB
+_NAMED = 12  # largest number of panels, and of points, that a line names
 
 
 class PointOptions(NamedTuple):
@@ -74,6 +76,7 @@ class AlignedPoints(NamedTuple):
                 f"{residual_um:.1f} um rms in a coordinate, the largest {lengths_um[worst]:.1f} um at "
                 f"{self.fitted.labels[worst]}; panels share its uncertainty"
             )
+        lines += [_off_line(one) for one in self.assigned.off_height]
         if (figure := self.figure) is not None:
             lines.append(
                 f"the panels have in common {1e3 * figure.common_m:.3f} mm rms ({1e3 * figure.mean_m:+.3f} mm in the "
@@ -129,6 +132,14 @@ class AlignedPoints(NamedTuple):
             "claimed_sigma_um": round(1e6 * repeats.claimed_m, 4) if repeats else 0.0,
             "repeat_shift_um": repeats and round(1e6 * repeats.shift_m, 4),
             "reference_residuals_um": fitted and (1e6 * fitted.residuals_m).round(4).tolist(),
+            "off_height": [
+                {
+                    "off_um": round(1e6 * one.off_m, 1),
+                    "panels": [panel._asdict() for panel in one.panels],
+                    "points": [point._asdict() for point in one.points],
+                }
+                for one in assigned.off_height
+            ],
             "labels": [{**point._asdict(), "label": label} for point, label in assigned.labels.items()],
         }
 
@@ -169,6 +180,23 @@ def align_points(run_dir: Path | None, settings: Mapping[str, object], options: 
     result = survey_result(mirror, cfg.align, options.offset_m, measured, planned, shared)
     figure = common_figure(mirror, result, cfg.align.false_alarm)
     return AlignedPoints(cfg, mirror, assigned, result, fitted, figure)
+
+
+def _off_line(one: OffHeight) -> str:
+    """What lies too high or too low, and why that may be."""
+    panels = [f"{row}/{col}" for row, col in one.panels]
+    points = [f"{row}/{col}/{number}" for row, col, number in one.points]
+    names = [
+        f"{kind}{'s' if len(some) > 1 else ''} {', '.join(some[:_NAMED])}"
+        + (f" and {len(some) - _NAMED} more" if len(some) > _NAMED else "")
+        for kind, some in (("panel", panels), ("point", points))
+        if some
+    ]
+    return (
+        f"{1e3 * abs(one.off_m):.2f} mm {'higher' if one.off_m > 0 else 'lower'} than the target's offset says: "
+        f"{' and '.join(names)}; another target nest, or a wrong offset? a panel is hardly so far off, and its moves "
+        "contain it; give these points in a file of their own with their offset"
+    )
 
 
 def _in_world(

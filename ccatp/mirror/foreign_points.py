@@ -1,7 +1,7 @@
 """Points that another instrument measured, as measured points of panels: frame, panel of each point, checks, sigmas."""
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import permutations, product
 from typing import Literal, NamedTuple
@@ -26,6 +26,8 @@ _MOST_RESIDUAL_M = 1e-3  # rms in a coordinate of references that an instrument 
 _TWICE = (1.8, 2.2)  # deviations over the target's offset if its sign is wrong
 # The middle of all points is never further from the surface: panels differ from it by tenths of a millimetre.
 _ON_SURFACE_M = 0.003
+# Panels are off by tenths of a millimetre; heights of target nests differ by millimetres.
+_OFF_HEIGHT_M = 0.001
 
 
 class PointsError(UsageError):
@@ -157,12 +159,24 @@ class Repeats(NamedTuple):
         return max(1.0, (self.sigma_m / self.claimed_m) ** 2) if self.readings >= _REPEATS else 1.0
 
 
+class OffHeight(NamedTuple):
+    """Points of panels that lie ``off_m`` above the height that the target's offset gives, as by another nest.
+
+    ``points``: those of panels of which others lie as they should; ``panels``: with all their points.
+    """
+
+    off_m: float
+    panels: tuple[PanelId, ...]
+    points: tuple[PointId, ...]
+
+
 class Assigned(NamedTuple):
     """Measured points by panel, the label of each, and repeated readings; their mean is the point.
 
     ``by_position``: readings whose label names no panel. ``copies``: copies of others to the last digit,
     which count once. ``row_first``: names of the observatory have the row first.
     ``shifts`` (3, 1) of each point: the error of the mean that all points share by shifts between readings.
+    ``off_height``: points too high or too low by millimetres, together if by the same.
     """
 
     measured: tuple[Measured, ...]
@@ -172,6 +186,7 @@ class Assigned(NamedTuple):
     row_first: bool
     repeats: Repeats | None
     shifts: Mapping[PointId, FloatArray]
+    off_height: tuple[OffHeight, ...]
 
 
 def check_on_mirror(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float) -> FloatArray:
@@ -242,6 +257,7 @@ def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float, fals
     measured, labels, normals = list[Measured](), dict[PointId, str](), dict[PointId, tuple[FloatArray, int]]()
     readings = list[list[FloatArray]]()
     claimed = list[float]()
+    above = dict[PointId, float]()
     copies = 0
     for panel, rows in sorted(by_panel.items()):
         own = {points[at].place_m: at for at in reversed(rows)}
@@ -261,6 +277,7 @@ def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float, fals
             )
             measured.append(Measured(point, fix))
             labels[point] = points[same[0]].label
+            above[point] = float(np.mean(feet[same, 2])) - offset_m
             normals[point] = normal, len(same)
     repeats = _repeats(readings, claimed, false_alarm) if claimed else None
     shift_m = 0.0 if repeats is None else repeats.shift_m
@@ -274,7 +291,28 @@ def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float, fals
         shifts={
             point: shift_m / np.sqrt(count) * normal[:, None] for point, (normal, count) in normals.items() if shift_m
         },
+        off_height=_off_height(above),
     )
+
+
+def _off_height(above_m: Mapping[PointId, float]) -> tuple[OffHeight, ...]:
+    """Points that are too high or too low, in groups of about the same height."""
+    off = sorted((value, point) for point, value in above_m.items() if abs(value) > _OFF_HEIGHT_M)
+    groups = list[list[tuple[float, PointId]]]()
+    for value, point in off:
+        if groups and value - groups[-1][-1][0] < _OFF_HEIGHT_M and value * groups[-1][-1][0] > 0.0:
+            groups[-1].append((value, point))
+        else:
+            groups.append([(value, point)])
+    sizes = Counter(point.panel for point in above_m)
+    found = []
+    for group in groups:
+        points = sorted(point for _, point in group)
+        own = Counter(point.panel for point in points)
+        panels = tuple(panel for panel in own if own[panel] == sizes[panel])
+        others = tuple(point for point in points if point.panel not in panels)
+        found.append(OffHeight(float(np.median([value for value, _ in group])), panels, others))
+    return tuple(found)
 
 
 def _named(

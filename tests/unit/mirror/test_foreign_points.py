@@ -16,7 +16,7 @@ from ccatp.mirror.point_file import PointFileError, parse_points
 from ccatp.sim.world import draw_misalignments
 from tests.support.command import answered
 from tests.support.scenario import config_of, world_of
-from tests.support.targets import M1, OFFSET_M, SIGMA_UM, is_recovered, labels, places, rows
+from tests.support.targets import M1, OFFSET_M, PANELS, SIGMA_UM, is_recovered, labels, places, rows
 
 
 @pytest.fixture
@@ -252,6 +252,31 @@ def test_what_all_panels_have_in_common_is_said(
     (line,) = said
     # The panels lie anyhow, by 0.05 mm rms: a tenth of that is common by chance.
     assert float(line.split("in common ")[1].split(" mm")[0]) == pytest.approx(expected_mm, abs=0.03)
+
+
+LOWER = "6.23 mm lower than the target's offset says: "
+HIGHER = "2.12 mm higher than the target's offset says: "
+NESTS: dict[str, tuple[FloatArray, list[str]]] = {
+    "a panel": (np.where(np.arange(27) < 9, -6.35, 0.0), [LOWER + "panel 4/5;"]),
+    "two of three": (np.where(np.arange(27) < 18, 2.0, 0.0), [HIGHER + "panels 4/5, 5/4;"]),
+    "two nests": (np.repeat([-6.35, 2.0, 0.0], 9), [LOWER + "panel 4/5;", HIGHER + "panel 5/4;"]),
+    "points": (
+        np.where(np.isin(np.arange(27), [1, 5, 7]), -2.0, 0.0),
+        ["1.87 mm lower than the target's offset says: points 4/5/2, 4/5/6, 4/5/8;"],
+    ),
+    "tenths of a millimetre": (np.where(np.arange(27) < 9, -0.6, 0.0), []),
+}
+
+
+@pytest.mark.parametrize(("off_mm", "said"), NESTS.values(), ids=[*NESTS])
+def test_points_on_another_nest_are_named(off_mm: FloatArray, said: list[str], aligned: Callable[..., Any]) -> None:
+    """The panels lie 0.12 mm higher."""
+    normals = np.array([M1.rotate_world_from_deck(M1.panel(panel).axes[2]) for panel in PANELS])
+    found = aligned(rows(places(noise_um=1.0) + off_mm[:, None] * np.repeat(normals, 9, axis=0), labels()))
+    lines = [line for line in found["warnings"] if "another target nest" in line]
+    assert len(lines) == len(said) == len(found["instrument"]["off_height"])
+    for line, begin in zip(lines, said, strict=True):
+        assert line.startswith(begin)
 
 
 def test_points_of_two_frames_on_every_panel_are_no_outliers(aligned: Callable[..., Any]) -> None:
