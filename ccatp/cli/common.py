@@ -79,12 +79,32 @@ class ConfigFile(click.Path):
         return [*names, *super().shell_complete(ctx, param, incomplete)]
 
 
-class OutputFile(click.Path):
-    """A file to write, with one of the suffixes ``formats`` if given; a bad path is refused before the work."""
+class OutputFolder(click.Path):
+    """A folder to write into; ``files``: names there that might be those of input files."""
 
-    def __init__(self, *formats: str) -> None:
+    def __init__(self, *files: str) -> None:
+        super().__init__(file_okay=False, path_type=Path)
+        self.files = files
+
+    def written(self, path: Path) -> list[Path]:
+        """Files that the command may write, if it writes to ``path``."""
+        return [path / name for name in self.files]
+
+
+class OutputFile(click.Path):
+    """A file to write, with one of the suffixes ``formats`` if given; a bad path is refused before the work.
+
+    ``second``: added to the name of the file, it is the name of another one that is written beside it.
+    """
+
+    def __init__(self, *formats: str, second: str = "") -> None:
         super().__init__(dir_okay=False, path_type=Path)
         self.formats = formats
+        self.second = second
+
+    def written(self, path: Path) -> list[Path]:
+        """Files that the command writes, if it writes to ``path``."""
+        return [path, *([path.with_stem(path.stem + self.second)] if self.second else [])]
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """As ``click.Path.convert``."""
@@ -103,6 +123,59 @@ class OutputFile(click.Path):
         return path
 
 
+class CheckedCommand(click.Command):
+    """A command that never writes over a file that it reads, nor two results into one file."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """As ``click.Command.invoke``; a bad output is refused before the work."""
+        self._check_outputs(ctx)
+        return super().invoke(ctx)
+
+    def _check_outputs(self, ctx: click.Context) -> None:
+        outputs = list[tuple[str, Path]]()
+        inputs = [(key, value) for key, value in _changes(ctx).items() if isinstance(value, str)]
+        for param in self.params:
+            value, name = ctx.params.get(param.name or ""), _name_of(param)
+            for one in value if isinstance(value, tuple) else (value,):
+                if not isinstance(one, str | Path):
+                    continue
+                if isinstance(param.type, OutputFile | OutputFolder):
+                    outputs += [(name, file) for file in param.type.written(Path(one))]
+                else:
+                    # A text may name a file after an equals sign.
+                    inputs += [(name, part) for part in {str(one), str(one).partition("=")[2]} if part]
+        for at, (option, path) in enumerate(outputs):
+            for other, second in outputs[:at]:
+                if path.resolve() == second.resolve():
+                    raise click.UsageError(f"{other} and {option} name the same file {path}; name two")
+            for name, text in inputs:
+                if _would_replace(path, Path(text)):
+                    raise click.UsageError(
+                        f"{option}: {path} is an input, {name} {text}; nothing was written; name another file"
+                    )
+
+
+def _name_of(param: click.Parameter) -> str:
+    return param.opts[0] if isinstance(param, click.Option) else param.make_metavar(click.get_current_context())
+
+
+# What commands write into the folder of a run, and into any folder; all other files there are inputs.
+_RESULTS, _PICTURES = (".csv", ".html", ".pdf", ".png", ".svg", ".tum"), (".html", ".pdf", ".png", ".svg")
+
+
+def _would_replace(output: Path, source: Path) -> bool:
+    """Whether an output is the input file ``source``, or a file of the input folder ``source``."""
+    try:
+        if not output.exists() or not source.exists():
+            return False
+        if not source.is_dir():
+            return output.samefile(source)
+        results = _RESULTS if (source / "config.toml").exists() else _PICTURES
+        return source.resolve() in output.resolve().parents and output.suffix.lower() not in results
+    except (OSError, ValueError):  # a text that is no path
+        return False
+
+
 _errors_as_json = False
 
 
@@ -112,6 +185,8 @@ class CommandGroup(click.Group):
     ``sections``: titles in the help and the places of the commands below them, in this order; a command is imported
     when it is used. Without them there is one title.
     """
+
+    command_class = CheckedCommand
 
     def __init__(self, *args: Any, sections: Mapping[str, Sequence[Part]] | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -300,7 +375,7 @@ def example(*lines: str) -> str:
 
 def command(*examples: str, **attributes: Any) -> Callable[[Command], click.Command]:
     """``click.command`` with these examples at the end of its help."""
-    return click.command(epilog=example(*examples), **attributes)
+    return click.command(epilog=example(*examples), **{"cls": CheckedCommand, **attributes})
 
 
 def options(*decorators: Callable[[Command], Command]) -> Callable[[Command], Command]:

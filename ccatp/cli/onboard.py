@@ -105,8 +105,11 @@ def _check(kind: "RobotKind", cfg: "OnboardCommonConfig", *, json_output: bool) 
 @common.SETTINGS_OPTION
 @click.option("--wheels-are-free", is_flag=True, help="The robot is lifted: its wheels turn at up to full speed.")
 @click.option(
-    "--out", "out_dir", type=common.PATH, help="Folder for the step response: CSV, and a figure with matplotlib."
-)
+    "--out",
+    "out_dir",
+    type=common.OutputFolder(),
+    help="Folder for the step response: CSV, and a figure with matplotlib.",
+)  # fmt: skip
 @common.JSON_OPTION
 @click.pass_obj
 def tune(

@@ -81,7 +81,7 @@ pause      the robot stays where it is until resume; a new emergency or a
 
 
 def _operator_command(name: str, help_text: str) -> click.Command:
-    @click.command(name, help=help_text, epilog=common.example(f"ccatp {name}"))
+    @common.command(f"ccatp {name}", name=name, help=help_text)
     @DAEMON_OPTIONS
     def command(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
         folder = common.configured_folder(config_file, runtime_dir)
@@ -152,6 +152,7 @@ def _ask_observatory(
 
 
 @click.group(
+    cls=common.CommandGroup,
     invoke_without_command=True,
     epilog=common.example("ccatp alarms", "ccatp alarms ack wheel_blocked", "ccatp alarms history"),
 )

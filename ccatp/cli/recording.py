@@ -56,7 +56,7 @@ def info(path: Path, json_output: bool) -> int:
     )
 )
 @click.argument("path", metavar="FILE|RUN_DIR", type=common.PATH)
-@click.option("--out", type=common.PATH, help="The new file; FILE.recovered.mcap if not given.")
+@click.option("--out", type=common.OutputFile(), help="The new file; FILE.recovered.mcap if not given.")
 @common.json_option("As JSON on standard output, nothing else there.")
 def repair(path: Path, out: Path | None, json_output: bool) -> int:
     """Save what is intact of a recording that was cut off or damaged, as a new file with an index.
@@ -86,9 +86,11 @@ def repair(path: Path, out: Path | None, json_output: bool) -> int:
     )
 )
 @click.argument("path", metavar="FILE|RUN_DIR", type=common.PATH)
-@click.option("--tum", "tum_file", type=common.PATH, help="File for the estimates, a TUM trajectory.")
-@click.option("--truth", "truth_file", type=common.PATH, help="File for the simulated truth, a TUM trajectory.")
-@click.option("--ros2", "bag_dir", type=common.PATH, help="New directory for a ROS 2 bag (MCAP; extra ccatp[ros]).")
+@click.option("--tum", "tum_file", type=common.OutputFile(), help="File for the estimates, a TUM trajectory.")
+@click.option("--truth", "truth_file", type=common.OutputFile(), help="File for the simulated truth, a TUM trajectory.")
+@click.option(
+    "--ros2", "bag_dir", type=common.OutputFolder(), help="New directory for a ROS 2 bag (MCAP; extra ccatp[ros])."
+)
 def export(path: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: Path | None) -> None:
     """Write a recorded survey for other tools.
 

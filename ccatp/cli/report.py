@@ -5,7 +5,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,14 +26,16 @@ if TYPE_CHECKING:
 
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
-_FOLDER = click.Path(path_type=Path, file_okay=False)
+_FOLDER = common.OutputFolder()
 _FIGURES = click.option("--figures", type=_FOLDER, metavar="DIR", help="Also write the figures there: SVG, PNG, PDF.")
 _JSON = common.json_option("The figures of it as JSON on standard output.")
 
 
 @common.command("ccatp report runs/tonight", "ccatp report runs/tonight --figures figures --tables tables")
 @click.argument("run_dir", type=common.PATH)
-@click.option("--out", type=_FILE, metavar="FILE", help="The page; report.html in the run directory if not given.")
+@click.option(
+    "--out", type=common.OutputFile(), metavar="FILE", help="The page; report.html in the run directory if not given."
+)
 @_FIGURES
 @click.option("--tables", type=_FOLDER, metavar="DIR", help="Also write fixes, panels and moves there: CSV and ECSV.")
 @_JSON
@@ -55,7 +57,7 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, tables: Path |
 @common.command("ccatp compare runs/before runs/after", "ccatp compare runs/a runs/b --json")
 @click.argument("run_a", type=common.PATH)
 @click.argument("run_b", type=common.PATH)
-@click.option("--out", type=_FILE, metavar="FILE", help="The page; compare.html in RUN_B if not given.")
+@click.option("--out", type=common.OutputFile(), metavar="FILE", help="The page; compare.html in RUN_B if not given.")
 @_FIGURES
 @_JSON
 def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
@@ -201,6 +203,7 @@ def align(
     planned = {point.panel for point in survey.planned}
     before = [_measured_with(one, cfg, settings) for one in earlier]
     _check_order([*earlier, run_dir])
+    _check_copies([*earlier, run_dir], [*before, survey.measured])
     result, network = align_survey(cfg, mirror, survey.measured, planned, before)
     comparison = None if survey.injected is None else compare(result.panels, survey.injected)
     outliers = sum(len(panel.outliers) for panel in result.panels)
@@ -298,6 +301,17 @@ def _measured_with(run_dir: Path, cfg: "Config", settings: Mapping[str, object])
         if getattr(other.cfg.etalon, name) != getattr(cfg.etalon, name):
             raise UsageError(f"--with {run_dir}: its etalon.{name} is not that of the first run")
     return other.measured
+
+
+def _check_copies(run_dirs: Sequence[Path], surveys: "Sequence[Sequence[Measured]]") -> None:
+    """Refuse a survey that is given twice, or a copy of another: the same lengths would count as independent ones."""
+    for (first, some), (second, others) in combinations(zip(run_dirs, surveys, strict=True), 2):
+        seen = {one.fix.lengths_m for one in some if one.fix.lengths_m}
+        if number := sum(one.fix.lengths_m in seen for one in others):
+            raise UsageError(
+                f"--with: {first} and {second} have the same lengths at {number} points: they are one survey; "
+                "give each survey once"
+            )
 
 
 def _check_order(run_dirs: Sequence[Path]) -> None:

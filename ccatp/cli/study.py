@@ -11,7 +11,7 @@ import click
 from ccatp.cli import common
 
 
-class _StudyCommand(click.Command):
+class _StudyCommand(common.CheckedCommand):
     """A command whose help lists the studies; their table is read only when the help is requested."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -30,7 +30,7 @@ class _StudyCommand(click.Command):
 )
 @click.argument("name", metavar="NAME")
 @click.option(
-    "--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+    "--out", type=common.OutputFolder(), metavar="DIR",
     help="Where to write, studies/NAME if not given; a campaign that was stopped continues there.",
 )  # fmt: skip
 @click.option(
@@ -118,7 +118,7 @@ PAGE = "docs/measurements/bench.md"
 @click.option("--steps-only", is_flag=True, help="No missions.")
 @click.option("--frames-only", is_flag=True, help="Missions only.")
 @click.option(
-    "--markdown", type=click.Path(path_type=Path, dir_okay=False), is_flag=False, flag_value=PAGE, metavar="[FILE]",
+    "--markdown", type=common.OutputFile(), is_flag=False, flag_value=PAGE, metavar="[FILE]",
     help=f"Write the tables to FILE, below them what stood there by hand; {PAGE} if not named.",
 )  # fmt: skip
 @common.JSON_OPTION

@@ -67,13 +67,13 @@ FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 @click.option(
     "--tum",
     "tum_file",
-    type=common.OutputFile(),
+    type=common.OutputFile(second="_truth"),
     help="Write the path in the TUM format of evo, and the truth to NAME_truth beside it.",
 )
 @click.option(
     "--out",
     "out_dir",
-    type=common.PATH,
+    type=common.OutputFolder("path.csv", "path_delayed.csv", "readings.csv", "moving.csv", "graph.pyfg", "map.toml"),
     metavar="DIR",
     help="Write path, map, readings with innovations, and a factor graph.",
 )

@@ -7,6 +7,7 @@ from functools import partial
 from itertools import combinations
 from math import sqrt
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import numpy as np
@@ -646,6 +647,10 @@ def test_two_surveys_of_a_night_are_adjusted_together(tmp_path: Path, capsys: py
     assert [(one["row"], one["col"]) for one in found["panels"]] == [ALIGNED]
     assert main(["align", str(tmp_path / "first"), "--with", str(tmp_path / "other")]) == 2
     assert "its etalon.offset_sigma_m is not that of the first run" in capsys.readouterr().err
+    copytree(tmp_path / "first", tmp_path / "copy")
+    for same in ("first", "copy"):
+        assert main(["align", str(tmp_path / "first"), "--with", str(tmp_path / same)]) == 2
+        assert "the same lengths at 9 points: they are one survey" in capsys.readouterr().err
     # A change begins at a point and lasts, so the order of the surveys matters.
     for name, begun_s in (("first", 9000.0), ("second", 5000.0)):
         clock = RobotClock(is_simulation=True, now_ns=partial(round, 1e9 * begun_s))
