@@ -38,6 +38,7 @@ from tests.contract.test_etalon_client import (
     silence,
 )  # fmt: skip
 from tests.faults.linking import Measured
+from tests.support.cases import slow_case
 from tests.support.mission_story import FREE, Story, from_first_leg
 from tests.support.scenario import any_port, config_of, mirror_of, one_panel
 from tests.support.sim_survey import (
@@ -352,7 +353,7 @@ def test_a_robot_put_elsewhere_is_accepted_after_three_fixes(
 
 
 @pytest.mark.fault("E5")
-@pytest.mark.parametrize("name", ["fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2"])
+@pytest.mark.parametrize("name", ["fyst-m1", slow_case("fyst-m2"), slow_case("thesis-m1"), "thesis-m2"])
 def test_every_exchange_of_axes_and_units_is_refused_at_the_first_fix(name: str, measured: Measured) -> None:
     cfg, mirror = config_of(name), mirror_of(name)
     puck = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)

@@ -33,6 +33,7 @@ from ccatp.survey.planning.search import (
     turn_time,
 )
 from ccatp.survey.planning.tour_bound import tour_bound
+from tests.support.cases import slow_case
 from tests.support.scenario import world_of
 
 
@@ -208,7 +209,7 @@ def test_measuring_time_counts_per_point(thesis: Any) -> None:
     assert tour_bound(thesis.mirror, [], thesis.cfg.limits, 2.0) == 0.0
 
 
-@pytest.mark.parametrize("name", ["thesis-m1", "fyst-m2"])
+@pytest.mark.parametrize("name", ["thesis-m1", slow_case("fyst-m2")])
 def test_whole_mirrors(name: str) -> None:
     """Planned with all stops on the way: within 6 % of what no tour can beat, and a fifth faster than the thesis's."""
     world = world_of(name)
