@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.datasets.events import EVENTS, READING_KINDS, Recording, is_events_csv, name_of
-from ccatp.beacons.datasets.headers import SECONDS, Column, column_of
+from ccatp.beacons.datasets.headers import LENGTHS, SECONDS, SPEEDS, Column, column_of
 from ccatp.beacons.datasets.tables import (
     COMMENTS,
     NotTextError,
@@ -42,6 +42,7 @@ class ColumnFile(NamedTuple):
     columns: list[Column | None]
     rows: list[tuple[int, list[str]]]
     places: Mapping[str, int]  # index of the column of each quantity: of several that with the earliest name
+    unknown: tuple[str, ...] = ()  # headers of columns that are not understood
 
     @property
     def quantities(self) -> set[str]:
@@ -136,7 +137,13 @@ def read_columns(path: Path) -> Recording:
     numbers: dict[str, float] = {}
     tags: dict[str, float] = {}
     table = _read(file, text)
-    warnings = _exchanged(table)
+    warnings = [
+        f"{one.file.name}: {'column' if len(one.unknown) == 1 else 'columns'} not understood, not used: "
+        f"{listed(one.unknown)}"
+        for one in (table, *others.values())
+        if one.unknown
+    ]
+    warnings += _exchanged(table)
     events = tables_of(file, _readings(table, numbers, tags))
     events |= dict([_motion(odometry[0])])
     if truths:
@@ -228,7 +235,14 @@ def _read(file: Path, text: str) -> ColumnFile:
     if not rows:
         raise RadioDataError(file, "holds no rows below its header")
     ranked = sorted((column.rank, k, column.quantity) for k, column in enumerate(columns) if column)
-    return ColumnFile(file, columns, rows, {quantity: k for _, k, quantity in reversed(ranked)})
+    headers = split_cells(header, mark)
+    is_named = any(column and column.quantity == "beacon" for column in columns)  # a beacon's own columns are none then
+    unknown = tuple(
+        name
+        for name, column in zip(headers, columns, strict=True)
+        if name and (column is None or (is_named and column.beacon))
+    )
+    return ColumnFile(file, columns, rows, {quantity: k for _, k, quantity in reversed(ranked)}, unknown)
 
 
 def _is_other_table(text: str) -> bool:
@@ -309,10 +323,26 @@ def _motion(table: ColumnFile) -> tuple[str, Table]:
     kind, names = ("speed", ("speed", "rate")) if "speed" in table.quantities else ("odom", ("range", "turn"))
     if not {*names} <= table.quantities:
         raise RadioDataError(table.file, "odometry with a turn has no distance: time, distance, turn are needed", 1)
-    moves = table.values("time", *names, "left")
-    if "left" not in table.quantities:
+    aside = _sideways(table, kind)
+    moves = table.values("time", *names, aside)
+    if aside not in table.quantities:
         moves.values[:, 3] = 0.0
     return kind, moves
+
+
+def _sideways(table: ColumnFile, kind: str) -> str:
+    """The quantity of the motion to the left. Raises RadioDataError: a speed beside distances, or the reverse."""
+    for quantity in ("lateral", "left_m", "left"):
+        k = table.places.get(quantity)
+        column = None if k is None else table.columns[k]
+        if column is None:
+            continue
+        is_speed = quantity == "left" or column.unit in SPEEDS
+        if is_speed if kind == "odom" else column.unit in LENGTHS:
+            has, wanted = ("distances", "a distance") if kind == "odom" else ("speeds", "a speed")
+            raise RadioDataError(table.file, f"odometry of {has} has another unit to the left: give {wanted}, too", 1)
+        return quantity
+    return "lateral"
 
 
 def _survey(table: ColumnFile, numbers: dict[str, float]) -> Table:

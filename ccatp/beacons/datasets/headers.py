@@ -36,7 +36,14 @@ HEADERS = {
     "qz": ("qz", "q_z", "orientation_z"),
     "qw": ("qw", "q_w", "orientation_w"),
     "speed": ("speed", "v", "vx", "velocity", "linear", "linear_x"),
-    "left": ("vy", "lateral_speed", "linear_y"),
+    "left": (
+        "vy", "v_y", "lateral_speed", "lateral_velocity", "linear_y", "v_lateral", "vlat", "speed_left", "left_speed",
+        "side_speed", "speed_lateral", "velocity_y",
+    ),
+    "lateral": (
+        "lateral", "lateral_distance", "distance_lateral", "sideways", "side", "aside", "strafe", "dlateral",
+        "d_lateral", "distance_left", "left_distance", "sway",
+    ),
     "rate": ("w", "omega", "rate", "yaw_rate", "turn_rate", "wz", "angular", "angular_z"),
     "turn": ("turn", "dtheta", "dyaw", "dphi"),
     "forward_m": ("forward", "ahead"),
@@ -72,7 +79,7 @@ UNITS_OF = {
     "time": TIMES, "fraction": TIMES, "range": LENGTHS, "x": LENGTHS, "y": LENGTHS, "z": LENGTHS, "sigma": LENGTHS,
     "beacon_x": LENGTHS, "beacon_y": LENGTHS, "beacon_z": LENGTHS,
     "forward_m": LENGTHS, "left_m": LENGTHS, "up_m": LENGTHS, "bearing": ANGLES, "heading": ANGLES, "turn": ANGLES,
-    "speed": SPEEDS, "left": SPEEDS, "rate": RATES, "rssi": LEVELS,
+    "speed": SPEEDS, "left": SPEEDS, "lateral": LENGTHS | SPEEDS, "rate": RATES, "rssi": LEVELS,
 }  # fmt: skip
 SUFFIXES = {unit for units in UNITS_OF.values() for unit in units}
 NO_UNIT = ("", "-", "1", "none", "utc")
@@ -88,6 +95,7 @@ class Column(NamedTuple):
     factor: float
     rank: int = 0
     problem: str = ""  # why its values cannot be read
+    unit: str = ""
 
 
 def column_of(header: str) -> Column | None:
@@ -110,7 +118,7 @@ def _column(header: str, quantity: str, unit: str, beacon: str = "", rank: int =
     if not units or unit in NO_UNIT:
         return Column(quantity, beacon, NANOSECOND if quantity == "fraction" else 1.0, rank)
     if unit in units:
-        return Column(quantity, beacon, units[unit], rank)
+        return Column(quantity, beacon, units[unit], rank, unit=unit)
     problem = f"column {header.strip()!r}: {unit!r} is no unit of a {quantity}: {', '.join(units)} are known"
     return Column(quantity, beacon, np.nan, rank, problem)
 

@@ -132,6 +132,43 @@ def test_the_same_run_comes_from_tables_and_from_a_graph(make: Callable[[Path], 
     assert found.kind == "csv"
 
 
+@pytest.mark.parametrize(
+    ("header", "is_speed"),
+    [
+        ("time,distance,lateral,turn", False),
+        ("time,distance [m],lateral [m],turn", False),
+        ("time,distance,left,turn", False),
+        ("time,distance_m,lateral_m,turn_rad", False),
+        ("time,dist,sideways,dtheta", False),
+        ("time,speed,lateral,rate", True),
+        ("time,speed_m_s,lateral_m_s,turn_rate", True),
+        ("time,vx,vy,wz", True),
+        ("time,v,lateral_velocity,omega", True),
+    ],
+)
+def test_motion_to_the_left_is_taken_whatever_its_column_is_named(header: str, is_speed: bool, tmp_path: Path) -> None:
+    file = long_form(tmp_path)
+    moves = np.column_stack([np.full(41, 0.2), np.linspace(-0.1, 0.1, 41), np.full(41, 0.05)])
+    rows = [(0.5 * k, *(moves[k] / (0.5 if is_speed else 1.0)).tolist()) for k in range(41)]
+    write_lines(tmp_path / "odometry.csv", lines_of(header, rows))
+    run = read_run(file, None, None)
+    np.testing.assert_allclose(run.steps.lateral_m, moves[:-1, 1] if is_speed else moves[1:, 1], atol=1e-9)
+    assert not any("not understood" in line for line in run.warnings)
+
+
+def test_columns_that_are_not_understood_are_named_once(tmp_path: Path) -> None:
+    file = long_form(tmp_path)
+    write_lines(tmp_path / "odometry.csv", lines_of("time,x,y,yaw,drift,slip", [(*row, 0, 0) for row in POSES]))
+    write_lines(tmp_path / "ground_truth.csv", lines_of("time,x,y,yaw,north", [(*row, 0) for row in POSES]))
+    rewritten(tmp_path, "time,anchor,range,,range_std,range_true", *(f"{t},{n},{r},,0.1,{r}" for t, n, r in RANGES))
+    said = [line for line in read_run(file, None, None).warnings if "not understood" in line]
+    assert said == [
+        "uwb.csv: columns not understood, not used: range_std, range_true",
+        "ground_truth.csv: column not understood, not used: north",
+        "odometry.csv: columns not understood, not used: drift, slip",
+    ]
+
+
 def test_other_files_of_the_folder_are_not_read(tmp_path: Path) -> None:
     write_lines(tmp_path / "events.csv", csv_lines(W))
     write_lines(tmp_path / "notes.csv", ["time,note", "1,windy, and cold"])
@@ -161,6 +198,8 @@ def rewritten(folder: Path, *lines: str) -> Path:
         (lambda folder: rewritten(folder, "time,id,range", "noon,A,2"), "csv:2: time is 'noon', not a number"),
         (lambda folder: rewritten(folder, "time,id,range [ns]", "1,A,2"), "csv:1: column .*: 'ns' is no unit"),
         (lambda folder: write_lines(folder / "odometry.csv", ["time,dx,dtheta", "0,1,0"]), "a turn has no distance"),
+        (lambda folder: write_lines(folder / "odometry.csv", ["t,dist,vy,turn", "0,1,0,0"]), "unit to the left"),
+        (lambda folder: write_lines(folder / "odometry.csv", ["t,v,lateral_m,w", "0,1,0,0"]), "give a speed, too"),
         (lambda folder: write_lines(folder / "more.csv", ["time,x,y,yaw", "0,0,0,0"]), "has 2 tables of odometry"),
         (
             lambda folder: write_lines(folder / "old.csv", ["anchor,x,y", "6,9,9"]),
