@@ -16,6 +16,7 @@ from ccatp.beacons.datasets.trajectory import (
     at_antenna,
     bridged,
     checked_heading,
+    heading_as_written,
     motions_between,
     pose_of_truth,
     way_at,
@@ -288,8 +289,9 @@ def _truth(reference: Table | None, steps: Steps, warnings: list[str], turns_hea
     known = np.isfinite(heading)
     if known.any() and not known.all():
         warnings.append(reference.note(~known, "of truth without heading (the first here): no heading is used"))
-    heading = np.unwrap(heading) if known.all() else np.full(len(t), np.nan)
-    return checked_heading(ReferencePath(t, x, y, heading), steps, warnings, turns=turns_heading)
+    truth = ReferencePath(t, x, y, heading if known.all() else np.full(len(t), np.nan))
+    heading = heading_as_written(truth, steps, warnings, turns=turns_heading)
+    return checked_heading(truth._replace(heading_rad=heading), steps, warnings, turns=turns_heading)
 
 
 def _survey(

@@ -18,6 +18,8 @@ AGREEMENT = 0.8  # length of the mean vector of (course - heading) above which t
 LARGEST_SIDESLIP_RAD = 0.3  # a smaller constant difference is sideslip; a larger one is an error of the reference
 CONSTANT_RAD = 1e-6  # span of a heading that never changes
 TURNED_RAD = 0.5  # by the odometry meanwhile
+FEWEST_CHORDS = 20
+DRIFTS = 40  # chords, after which the heading of the odometry is taken anew
 STRAIGHT = 0.95  # length of the mean vector of the course above which the path does not turn
 PIECE_S = 10.0  # long enough for one or two turns, short enough for the drift of odometry
 PIECE_POINTS = 40
@@ -119,6 +121,63 @@ def chords(truth: ReferencePath, steps: Steps) -> npt.NDArray[np.int64]:
         return rows[:0]
     marks = np.arange(0.0, way[-1], CHORD_M)
     return np.asarray(rows[np.unique(np.minimum(np.searchsorted(way, marks), rows.size - 1))])
+
+
+# How else headings are written: the words for it, factor, direction of zero.
+_DEGREE = np.pi / 180.0
+WRITTEN = (
+    ("in degrees", _DEGREE, 0.0),
+    ("clockwise from the y axis, as those of a compass", -1.0, 0.5 * np.pi),
+    ("in degrees clockwise from the y axis, as those of a compass", -_DEGREE, 0.5 * np.pi),
+    ("clockwise", -1.0, 0.0),
+    ("in degrees clockwise", -_DEGREE, 0.0),
+)
+CLEARLY = 0.3  # of the circular variance of course - heading remains if headings are read in the other way
+CONTRADICTS = 0.5  # length of its mean vector, below which headings have little to do with the course
+
+
+def heading_as_written(truth: ReferencePath, steps: Steps, warnings: list[str], *, turns: bool = True) -> FloatArray:
+    """The heading of a truth, rad, counter-clockwise from x, continuous, shape (k,), whatever its unit and direction.
+
+    What it is, is told by the course of the truth, and for a direction of turning by the odometry, too: it must turn as
+    the course does. If the headings contradict a course with which the odometry agrees, they are NaN. ``turns``:
+    whether to change them; else there is only the warning. ``truth``: with headings as they were written.
+    """
+    as_is = np.unwrap(truth.heading_rad)
+    rows = chords(truth, steps)
+    if rows.size < FEWEST_CHORDS or not np.isfinite(truth.heading_rad).all() or np.ptp(truth.heading_rad) == 0.0:
+        return as_is
+    t = truth.times_s[rows]
+    ahead_m, left_m = (np.diff(amount_at(steps, column, t)) for column in (steps.distance_m, steps.lateral_m))
+    way_m = np.hypot(ahead_m, left_m)
+    moves = (np.diff(truth.x_m[rows]) + 1j * np.diff(truth.y_m[rows])) * (ahead_m - 1j * left_m)
+    moves = np.where(way_m > 0.5 * CHORD_M, moves / np.maximum(np.abs(moves), 1e-9), 0.0)  # without jumps of the truth
+    count = max(int((way_m > 0.5 * CHORD_M).sum()), 1)
+
+    def mean_of(heading_rad: FloatArray) -> complex:
+        ends = np.exp(1j * heading_rad)
+        return complex((moves * (ends[1:] + ends[:-1]).conj()).sum() / (2.0 * count))
+
+    def odometry_agrees(sign: float) -> float:
+        middle = 0.5 * (turned[1:] + turned[:-1])
+        parts = np.array_split(moves * np.exp(-1j * sign * middle), max(moves.size // DRIFTS, 1))
+        return float(np.sum([abs(part.sum()) for part in parts]) / count)
+
+    turned = amount_at(steps, steps.turn_rad, t)
+    is_course = odometry_agrees(1.0) > max(AGREEMENT, odometry_agrees(-1.0))
+    now = abs(mean_of(truth.heading_rad[rows]))
+    for what, factor, zero_rad in WRITTEN:
+        mean = mean_of(zero_rad + factor * truth.heading_rad[rows])
+        fits = abs(mean) > AGREEMENT and 1.0 - abs(mean) < CLEARLY * (1.0 - now)
+        if fits and (factor > 0.0 or (is_course and abs(np.angle(mean)) < LARGEST_SIDESLIP_RAD)):
+            done = "they were converted" if turns else "they are used as they are"
+            warnings.append(f"headings of the truth fit its course {what}: {done}")
+            return np.unwrap(zero_rad + factor * truth.heading_rad) if turns else as_is
+    if is_course and now < CONTRADICTS:
+        done = "not used" if turns else "used as they are"
+        warnings.append(f"headings of the truth contradict its course, with which the odometry agrees: {done}")
+        return np.full(as_is.size, np.nan) if turns else as_is
+    return as_is
 
 
 def checked_heading(truth: ReferencePath, steps: Steps, warnings: list[str], *, turns: bool = True) -> ReferencePath:

@@ -13,7 +13,8 @@ from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.estimation.recording import RecordedRun, dead_reckoned
 from ccatp.beacons.studies.recordings import estimate
-from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, world, write_lines
+from ccatp.core import FloatArray
+from tests.unit.beacons.datasets.sets import BEACONS, World, csv_lines, world, write_lines
 
 W = world(seconds=60.0)
 LINES = [line for line in csv_lines(W) if not line.startswith("bearing")]
@@ -234,6 +235,61 @@ def test_the_course_of_a_vehicle_that_drives_sideways_is_no_error_of_its_heading
     run, said = read(tmp_path, lambda lines: turned(each("odom", sideways)(lines)))
     assert "truth heading is turned" not in said
     assert run.first_pose[2] == pytest.approx(W.poses[0, 2] - 0.43)
+
+
+AS_WRITTEN: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "in degrees": np.rad2deg,
+    "clockwise from the y axis, as those of a compass": lambda h: 0.5 * np.pi - h,
+    "in degrees clockwise from the y axis, as those of a compass": lambda h: np.rad2deg(0.5 * np.pi - h) % 360.0,
+    "clockwise": lambda h: -h,
+    "in degrees clockwise": lambda h: -np.rad2deg(h),
+}
+
+
+def with_truth_headings(w: World, headings: FloatArray) -> list[str]:
+    rows = [f"truth,{t},{x},{y},{h}" for t, (x, y, _), h in zip(w.times_s, w.poses, headings, strict=True)]
+    return [*(line for line in csv_lines(w) if not line.startswith("truth")), *rows]
+
+
+@pytest.mark.parametrize("what", AS_WRITTEN)
+@pytest.mark.parametrize("turns_heading", [True, False])
+def test_headings_of_another_unit_or_direction_are_named_and_converted(
+    what: str, turns_heading: bool, tmp_path: Path
+) -> None:
+    w = world()
+    wrapped_rad = (w.poses[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    written = AS_WRITTEN[what](wrapped_rad)
+    file = write_lines(tmp_path / "run.csv", with_truth_headings(w, written))
+    run = read_run(file, None, None, turns_heading=turns_heading)
+    done = "converted" if turns_heading else "used as they are"
+    (said,) = (line for line in run.warnings if "headings" in line)
+    assert said.startswith(f"headings of the truth fit its course {what}: they ")
+    assert said.endswith(done)
+    if turns_heading:
+        assert run.truth is not None
+        np.testing.assert_allclose(np.exp(1j * run.truth.heading_rad), np.exp(1j * w.poses[:, 2]), atol=1e-9)
+        assert run.first_pose == pytest.approx((*w.poses[0, :2], wrapped_rad[0]))
+        assert not any("true turns" in line or "other way" in line for line in run.warnings)
+
+
+def test_headings_that_contradict_the_course_are_not_used(tmp_path: Path) -> None:
+    w = world()
+    headings = np.random.default_rng(1).uniform(-np.pi, np.pi, len(w.poses))
+    run = read_run(write_lines(tmp_path / "run.csv", with_truth_headings(w, headings)), None, None)
+    assert run.truth is not None
+    assert np.isnan(run.truth.heading_rad).all()
+    assert "headings of the truth contradict its course, with which the odometry agrees: not used" in run.warnings
+    assert run.first_pose == pytest.approx(w.poses[0], abs=0.1)
+
+
+def test_headings_are_not_taken_as_clockwise_if_the_odometry_turns_the_other_way(tmp_path: Path) -> None:
+    w = world()
+    mirrored = [
+        ",".join([*cells[:3], str(-float(cells[3])), *cells[4:]]) if (cells := line.split(","))[0] == "truth" else line
+        for line in csv_lines(w)
+    ]
+    said = " | ".join(read_run(write_lines(tmp_path / "run.csv", mirrored), None, None).warnings)
+    assert "headings of the truth fit" not in said
 
 
 def test_a_turned_heading_can_be_kept(tmp_path: Path) -> None:
