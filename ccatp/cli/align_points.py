@@ -98,8 +98,8 @@ class AlignedPoints(NamedTuple):
             lines.append(f"{self.assigned.copies} readings are copies of others to the last digit, and count once")
         if self.assigned.by_position:
             lines.append(
-                f"{self.assigned.by_position} readings are assigned to panels by position, as their labels name none: "
-                "a mirrored axis along which the mirror is symmetric would not show"
+                f"{self.assigned.by_position} readings are assigned to panels by position, as no label names their "
+                "panel: a mirrored axis along which the mirror is symmetric would not show"
             )
         lines += [
             f"point {'/'.join(map(str, point))} is {self.assigned.labels[point]!r} of the file"

@@ -1,6 +1,5 @@
 """Points that another instrument measured, as measured points of panels: frame, panel of each point, checks, sigmas."""
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import permutations, product
@@ -13,6 +12,7 @@ from ccatp.core import BoolArray, Fix, FloatArray, Measured, PanelId, PointId, V
 from ccatp.errors import UsageError
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import SurveyResult
+from ccatp.mirror.point_file import OBSERVATORY_NAME, OUR_NAME
 from ccatp.mirror.surface import ConvergenceError
 
 Frame = Literal["world", "mirror", "telescope", "own"]
@@ -21,6 +21,8 @@ _SAME_PLACE_M = 0.003  # repeated readings of a target
 _REPEATS = 3  # least number of repeated readings that show a scatter
 _LEAST_MODE = 1e-3  # part of the largest mode from which a common one counts
 _AXIS_SHIFT_M = 0.12  # between the optical frame and that of the azimuth axis, along the elevation axis
+_FEW = 2  # points that may lie elsewhere, if the frame is right
+_NAMED = 5  # points that a message names
 _FRAME_RATIO = 10.0  # of residuals of the references without and with a mirrored axis, from which the frame is mirrored
 _MOST_RESIDUAL_M = 1e-3  # rms in a coordinate of references that an instrument measures to hundredths of a millimetre
 _TWICE = (1.8, 2.2)  # deviations over the target's offset if its sign is wrong
@@ -114,19 +116,15 @@ def frame_errors(fitted: Fitted, places_m: FloatArray) -> FloatArray:
     return np.array([np.hstack([_cross(one), np.eye(3)]) @ root for one in places_m - fitted.centre_m])
 
 
-_OURS = re.compile(r"(\d{1,2})[/-](\d{1,2})(?:[/-](\w+))?$")
-_OBSERVATORY = re.compile(r"(?:\d\d-\d\d|\d)([12])([1-9])([1-9])\d(?:\D.*)?$")
-
-
 def panel_of_label(label: str, mirror: Mirror, *, row_first: bool = False) -> PanelId | None:
     """The panel that a label names: ours, ``3/7`` or ``3/7/4``, or the observatory's ``12281``; None without a panel.
 
     The observatory's digits: telescope (also as ``01-01``), mirror, column, row, number; row before column with
     ``row_first``. Raises ``PointsError``: it is of the other mirror.
     """
-    if (match := _OURS.match(label)) is not None:
+    if (match := OUR_NAME.match(label)) is not None:
         panel = PanelId(int(match[1]), int(match[2]))
-    elif (match := _OBSERVATORY.match(label)) is not None:
+    elif (match := OBSERVATORY_NAME.match(label)) is not None:
         if mirror.name[-2:] in ("m1", "m2") and mirror.name[-1] != match[1]:
             raise PointsError(f"label {label} is of mirror {match[1]}, the mirror is {mirror.name}; give --mirror")
         first, second = int(match[2]), int(match[3])
@@ -229,7 +227,16 @@ def _why_far(mirror: Mirror, points: Sequence[ForeignPoint], world: FloatArray, 
             if far.all():
                 return f"{where}: the file is in {text}; {'convert it to mm' if factor == 25.4 else 'give --unit'}"
             return f"{where}: mixed units, {int(far.sum())} of {len(points)} points are in {text}"
+    off = int(far.sum())
     limit = 0.9 * len(world)
+    if 2 * off < len(points) and off <= max(_FEW, len(points) - limit):
+        # The others lie on the mirror: the frame is right.
+        names = ", ".join(one.label or f"line {one.line}" for one, is_off in zip(points, far, strict=True) if is_off)
+        which = names if off <= _NAMED else "the first of them"
+        return (
+            f"{where}: {off} of {len(points)} points lie{'s' if off == 1 else ''} elsewhere ({which}); correct these "
+            "lines, or put # before them"
+        )
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             if order == (0, 1, 2) and signs == (1.0, 1.0, 1.0):
@@ -242,7 +249,6 @@ def _why_far(mirror: Mirror, points: Sequence[ForeignPoint], world: FloatArray, 
                 is_left = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)) < 0
                 kind = "a left-handed frame, or swapped axes" if is_left else "turned axes"
                 return f"{where}: with ({axes}) in place of (x, y, z) the points lie on it: {kind}"
-    off = int(far.sum())
     return f"{where}: {off} of {len(points)} points lie elsewhere; check --mirror, --frame and the unit"
 
 
@@ -393,7 +399,7 @@ def _numbers(points: Sequence[ForeignPoint], targets: Sequence[Sequence[int]]) -
     """The numbers of a panel's targets: those of labels like ``3/7/4``, otherwise in the order of the file."""
     found = dict[int, str]()
     for same in targets:
-        match = _OURS.match(points[same[0]].label)
+        match = OUR_NAME.match(points[same[0]].label)
         if match is None or match[3] is None or not match[3].isdecimal():
             return [*range(1, len(targets) + 1)]
         first = points[same[0]]

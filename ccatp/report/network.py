@@ -25,7 +25,11 @@ def sentence(found: CalibratedSurveys | None) -> str:
     if network.state is NetworkState.TOO_FEW:
         return f"The laser network is not checked: {len(found.points)} points with {lengths} lengths are too few."
     if network.state is NetworkState.CONSISTENT:
-        return f"The laser network is consistent: {lengths} lengths, {noise}, no channel and no collimator has changed."
+        is_noisy = network.is_noisy or bool(_noisy(found))
+        return (
+            f"The laser network is consistent{' within its noise' if is_noisy else ''}: {lengths} lengths, {noise}, "
+            "no channel and no collimator has changed."
+        )
     if not network.has_frame:
         return (
             "The laser network has changed, and keeps no frame of reference: fewer than three collimators agree with "
@@ -39,9 +43,10 @@ def sentence(found: CalibratedSurveys | None) -> str:
 def _noise(found: CalibratedSurveys) -> str:
     """The noise of the lengths, and that of channels which have more of it than the others."""
     network = found.network
-    text = f"noise {network.noise:.2f} times the configured one" if network.is_noisy else "noise as configured"
     channels = [f"in channel {channel} {noise:.1f} times the configured one" for channel, noise in _noisy(found)]
-    return ", ".join([text, *channels])
+    others = " of the other channels" if channels else ""
+    size = f"{network.noise:.2f} times the configured one" if network.is_noisy else "as configured"
+    return ", ".join([f"noise{others} {size}", *channels])
 
 
 def _noisy(found: CalibratedSurveys) -> list[tuple[int, float]]:

@@ -47,6 +47,17 @@ def changed(line: int, text: str, points: FloatArray = POINTS) -> str:
     return "\n".join(lines)
 
 
+HEADERS = "PointId", "Punkt", "Punktnummer", "Pt", "Nr", "Panel", "Nom", "Point_No.", "word that nobody knows"
+
+
+def renamed_head(head: str, points: FloatArray) -> str:
+    return head + renamed(NAMES, points)
+
+
+def in_columns(head: str, cells: Callable[[str], list[str]], points: FloatArray = POINTS) -> str:
+    return f"{head},x,y,z\n" + renamed([",".join(cells(name)) for name in NAMES], points)
+
+
 def many_readings() -> str:
     return "\n".join(line for seed in range(20) for line in rows(places(seed=seed), NAMES))
 
@@ -126,7 +137,52 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
     "header without x": (table(",", head="Name,East,North,Up\n"), SIGMA, "neither a point nor a header"),
     "title line": (table(",", head="Survey of M1, 2026-11-03\n"), SIGMA, "neither a point nor a header"),
     "line of units": (table(",", head="label,x,y,z\n,mm,mm,mm\n"), SIGMA, "put # before a line that is no point"),
-    "line at the end": (table(",") + "27 points, , ,\n", SIGMA, "1 columns; a line is"),
+    "line at the end": (table(",") + "27 points, , ,\n", SIGMA, ":28: '27 points' is no point"),
+    "text between the points": (changed(6, "! text"), SIGMA, ":6: '! text' is no point"),
+    "words between the points": (changed(6, "more text here"), SIGMA, ":6: 'more text here' is no point"),
+    "a label alone": (changed(6, "4/5/6,,,"), SIGMA, ":6: '4/5/6' is no point"),
+    **{
+        f"labels under {word}": (table(";", head=f"{word};X [mm];Y [mm];Z [mm]\n"), SIGMA, RIGHT)
+        for word in HEADERS
+    },
+    **{
+        f"labels under {word}, x mirrored": (
+            renamed_head(f"{word},x,y,z\n", POINTS * [-1, 1, 1]), SIGMA, "a left-handed frame",
+        )
+        for word in HEADERS
+    },
+    "row, col and point": (in_columns("row,col,point", lambda name: name.split("/")), SIGMA, RIGHT),
+    "row, col and point, x mirrored": (
+        in_columns("row,col,point", lambda name: name.split("/"), POINTS * [-1, 1, 1]), SIGMA, "a left-handed frame",
+    ),
+    "panel and point": (in_columns("panel,point", lambda name: name.rsplit("/", 1)), SIGMA, RIGHT),
+    "panel and point, x mirrored": (
+        in_columns("panel,point", lambda name: name.rsplit("/", 1), POINTS * [-1, 1, 1]), SIGMA, "a left-handed frame",
+    ),
+    "number and name, x mirrored": (
+        in_columns("Nr,Name", lambda name: [name[-1], name], POINTS * [-1, 1, 1]), SIGMA, "a left-handed frame",
+    ),
+    "two columns of names": (in_columns("a,b", lambda name: [name, name]), SIGMA, "columns 'a' and 'b' have names"),
+    "row alone": (in_columns("row,point", lambda name: [name[0], name[-1]]), SIGMA, "of row and col one is missing"),
+    "panel and another label": (
+        in_columns("panel,name", lambda name: [name[:3], f"1/2/{name[-1]}"]), SIGMA, "name two panels",
+    ),
+    **{
+        f"sigmas under {head}": (
+            with_sigmas(sigma, sigma, sigma, head=f"Point Name,X (mm),Y (mm),Z (mm),{head}\n"), (), message,
+        )
+        for head, sigma, message in (
+            ("Ux (1.0 sigma),Uy (1.0 sigma),Uz (1.0 sigma)", "0.015", RIGHT),
+            ("Ux (2 sigma),Uy (2 sigma),Uz (2 sigma)", "0.030", RIGHT),
+            ("Ux (k=2) [mm],Uy (k=2) [mm],Uz (k=2) [mm]", "0.030", RIGHT),
+            ("U95x,U95y,U95z", "0.030", RIGHT),
+            ("ux,uy,uz", "0.015", RIGHT),
+            ("Ux,Uy,Uz", "0.030", "'Ux' does not say of how many sigmas it is"),
+            ("Uncertainty X,Uncertainty Y,Uncertainty Z", "0.030", "'Uncertainty X' does not say of how many sigmas"),
+            ("sx (2 sigma),sy,sz", "0.030", "are not of as many sigmas"),
+            ("sx (0 sigma),sy (0 sigma),sz (0 sigma)", "0.030", "an uncertainty of 0 sigma is none"),
+        )
+    },
     "sx alone": (with_sigmas("0.015", head="label,x,y,z,sx\n"), (), "not all of sx, sy, sz"),
     "header without data": ("label,x,y,z\n", SIGMA, "a header and no points"),
     "empty": ("", SIGMA, "no points in it"),
@@ -144,6 +200,8 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
     # Places.
     "NaN": (changed(3, "4/5/3,nan,1.0,2.0"), SIGMA, "x is 'nan', which is no number"),
     "infinite": (changed(3, "4/5/3,1.0,inf,2.0"), SIGMA, "y is 'inf', which is no number"),
+    "too large for a number": (changed(6, "4/5/6,1e400,0,0"), SIGMA, "x is '1e400', which is no number"),
+    "one point elsewhere": (changed(6, "4/5/6,0.0,-2700.0,4000.0"), SIGMA, "1 of 27 points lies elsewhere (4/5/6)"),
     "one line in m": (
         changed(5, "4/5/5," + ",".join(str(v / 1e3) for v in POINTS[4])), SIGMA, "mixed units, 1 of",
     ),
