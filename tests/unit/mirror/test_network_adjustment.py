@@ -474,7 +474,11 @@ def test_a_noisy_channel_is_named_with_its_factor_in_the_sentence_and_in_the_dat
     result, network = align_survey(CFG, M1, survey(noisy, LIES), PANELS)
     assert network is not None
     expected = (
-        re.escape("The laser network is consistent: 288 lengths, noise as configured, in channel 3 ") + r"(.*?) times"
+        re.escape(
+            "The laser network is consistent within its noise: 288 lengths, noise of the other channels as configured, "
+            "in channel 3 "
+        )
+        + r"(.*?) times"
     )
     (factor,) = re.findall(expected, sentence(network))
     sigma_m = float(network.network.given.sigmas_m[:, M1.channels.index(3)].mean())
