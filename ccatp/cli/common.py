@@ -28,6 +28,7 @@ _NOT_WRITTEN = (errno.ENOSPC, errno.EIO, errno.EBADF)  # full device, closed ter
 RENAMED_COMMANDS = {"log": "recording", "recover": "repair", "map": "plot"}
 # Longer than any answer takes; libzmq accepts a time-out as an int in milliseconds.
 LONGEST_WAIT_S = 86_400.0
+_LONGEST_WARNING = 2000  # characters: a sentence is never cut, what a file contains may be
 # After which a command says that it works.
 PATIENCE_S = 2.0
 
@@ -54,6 +55,19 @@ class WaitingTime(_FloatType):
         if not 0.0 < time_s <= LONGEST_WAIT_S:
             self.fail(f"{value} is no time to wait; give more than 0 s, at most {LONGEST_WAIT_S:g} s", param, ctx)
         return time_s
+
+
+class FiniteNumber(_FloatType):
+    """A number that is not infinite, and not NaN."""
+
+    name = "float"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """As ``click.ParamType.convert``."""
+        number = float(click.FLOAT.convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is no finite number", param, ctx)
+        return number
 
 
 class ConfigFile(click.Path):
@@ -310,7 +324,7 @@ def complain(message: str, status: int) -> int:
 def warn(warnings: Iterable[str]) -> None:
     """A line on standard error for each warning."""
     for warning in warnings:
-        complain(f"warning: {one_line(warning)}", 0)
+        complain(f"warning: {one_line(warning, _LONGEST_WARNING)}", 0)
 
 
 @contextmanager

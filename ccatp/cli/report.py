@@ -144,7 +144,12 @@ def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: s
 @click.option(
     "--unit", type=click.Choice(["mm", "m", "um"]), help="Of --points, if its header does not say; mm otherwise."
 )
-@click.option("--offset-mm", type=float, default=0.0, help="Centre of the target over the surface, along the normal.")
+@click.option(
+    "--offset-mm",
+    type=common.FiniteNumber(),
+    default=0.0,
+    help="Centre of the target over the surface, along the normal.",
+)
 @click.option(
     "--sigma-um", type=click.FloatRange(min=0.0, min_open=True), help="Of each coordinate, instead of the file's."
 )
@@ -193,7 +198,7 @@ def align(
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.mirror_alignment import align_survey, compare
     from ccatp.records.run_reader import read_run
-    from ccatp.report.alignment import result_data, table_lines
+    from ccatp.report.alignment import result_data, table_lines, undetermined_warnings
     from ccatp.report.network import network_data, network_lines, remarks
 
     _check_effect(settings, ALIGN_KEYS, "the alignment")
@@ -213,11 +218,10 @@ def align(
         "world": cfg.world.name if survey.is_simulation else None,
         "seed": cfg.run.seed,
         "points": {"total": len(survey.planned), "measured": len(survey.measured), "outliers": outliers},
-        "adjusters": list(result.panels[0].adjusters) if result.panels else [],
-        "adjuster_places_mm": _places_mm(mirror, result),
+        **_adjuster_facts(mirror, result),
         "puck_height_sigma_um": round(cfg.align.puck_height_sigma_m * 1e6, 4),
     }
-    warnings = [*survey.warnings, *remarks(network), *result.warnings]
+    warnings = [*survey.warnings, *remarks(network), *result.warnings, *undetermined_warnings(result)]
     warnings += _write_files(cfg, mirror, result, Files(csv_file, work_list, figure_file), str(run_dir))
     common.warn(warnings)
     lines = [*table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m), *network_lines(network)]
@@ -234,13 +238,14 @@ def _align_points(
     json_output: bool,
 ) -> int:
     from ccatp.cli.align_points import align_points
-    from ccatp.report.alignment import result_data, table_lines
+    from ccatp.report.alignment import result_data, table_lines, undetermined_warnings
 
     _check_effect(settings, (*ALIGN_KEYS, "run.mirror"), "the alignment of points")
     found = align_points(run_dir, settings, options)
     measured = len(found.assigned.measured)
     facts = {
         "run_dir": str(options.points),
+        "points_file": str(options.points),
         "mirror": found.mirror.name,
         "world": None,
         "seed": 0,
@@ -249,11 +254,10 @@ def _align_points(
             "measured": measured,
             "outliers": sum(len(panel.outliers) for panel in found.result.panels),
         },
-        "adjusters": list(found.result.panels[0].adjusters) if found.result.panels else [],
-        "adjuster_places_mm": _places_mm(found.mirror, found.result),
+        **_adjuster_facts(found.mirror, found.result),
         "puck_height_sigma_um": 0.0,
     }
-    warnings = [*found.lines[1:], *found.result.warnings]
+    warnings = [*found.lines[1:], *found.result.warnings, *undetermined_warnings(found.result)]
     warnings += _write_files(found.cfg, found.mirror, found.result, files, str(options.points))
     common.warn(warnings)
     lines = [*table_lines(facts, found.result, None, 0.0), *found.lines]
@@ -262,14 +266,16 @@ def _align_points(
     return 0
 
 
-def _places_mm(mirror: "Mirror", result: "SurveyResult") -> list[list[float]]:
-    """Places of the adjusters in the panel frame; those of all panels are the same within 0.1 mm."""
-    from ccatp.mirror.panel_alignment import adjuster_places
+def _adjuster_facts(mirror: "Mirror", result: "SurveyResult") -> dict[str, Any]:
+    """Names and places of the adjusters, and the axes of the places."""
+    from ccatp.report.alignment import places_of
 
-    if not result.panels:
-        return []
-    places = adjuster_places(mirror, result.panels[0].panel)[1].tolist()
-    return [[round(1e3 * value, 1) for value in place] for place in places]
+    places = places_of(mirror, [panel.panel for panel in result.panels])
+    return {
+        "adjusters": list(places.names) if places else [],
+        "adjuster_places_mm": [list(place) for place in places.places_mm] if places else [],
+        "adjuster_axes": places.axes if places else "",
+    }
 
 
 def _write_files(cfg: "Config", mirror: "Mirror", result: "SurveyResult", files: Files, name: str) -> tuple[str, ...]:

@@ -12,6 +12,8 @@ from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import Moves, PanelResult, adjuster_places
 
+_MEANING = 3.0  # standard deviations of a move from which it is worth a turn
+_NAMED = 12  # largest number of panels that a message names
 _SIGMAS = 4.0  # of a difference that noise does not make in the several hundred adjusters of a mirror
 
 
@@ -19,7 +21,7 @@ class Step(NamedTuple):
     """One turn of one adjuster: its place in the panel frame, m; move, m; ``turns`` of the screw if known.
 
     ``round``: all adjusters of a panel are turned once in a round, so that none is ahead of the others by more than
-    the configured step.
+    the configured step. ``is_significant``: the whole move is more than three of its standard deviations.
     """
 
     panel: PanelId
@@ -30,23 +32,35 @@ class Step(NamedTuple):
     y_m: float
     move_m: float
     sigma_m: float
+    is_significant: bool
     turns: float | None
 
 
 class WorkList(NamedTuple):
-    """The steps of all panels, and the moves that exceed the travel, as texts; such panels have no steps."""
+    """The steps of panels, and as texts which panels have none: moves beyond the travel, or of no meaning."""
 
     steps: tuple[Step, ...]
     refused: tuple[str, ...]
 
 
 def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult]) -> WorkList:
-    """The rigid moves of the panels as steps in an order that exceeds no limit."""
+    """The rigid moves of the panels as steps in an order that exceeds no limit.
+
+    Panels whose points do not decide have none, and panels whose largest move is not three times the largest of their
+    standard deviations: their adjusters would follow the noise.
+    """
     steps, refused = list[Step](), list[str]()
+    undecided, unclear = list[PanelId](), list[PanelId]()
     travel_m, step_m, pitch_m = (1e-3 * value for value in (cfg.travel_mm, cfg.step_mm, cfg.pitch_mm))
     for panel in panels:
         moves = panel.rigid.moves
         worst = int(np.argmax(np.abs(moves.values_m)))
+        if panel.deciding is not None:
+            undecided.append(panel.panel)
+            continue
+        if abs(moves.values_m[worst]) < _MEANING * float(moves.sigma_m.max()):
+            unclear.append(panel.panel)
+            continue
         if travel_m and abs(moves.values_m[worst]) > travel_m:
             refused.append(
                 f"panel {panel.panel.row}/{panel.panel.col}: {panel.adjusters[worst]} has to move by "
@@ -61,8 +75,29 @@ def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult
             ):
                 part = move / max(rounds, 1)
                 turns = part / pitch_m if pitch_m else None
-                steps.append(Step(panel.panel, number, max(rounds, 1), name, x_m, y_m, part, sigma, turns))
+                is_significant = abs(move) >= _MEANING * sigma
+                steps.append(
+                    Step(panel.panel, number, max(rounds, 1), name, x_m, y_m, part, sigma, is_significant, turns)
+                )
+    small = sum(not step.is_significant for step in steps if step.round == 1)
+    if undecided:
+        refused.append(f"not in the work list, as their points do not decide: panels {_names(undecided)}")
+    if unclear:
+        refused.append(
+            f"not in the work list, as no move is {_MEANING:g} times the largest standard deviation of the panel's "
+            f"moves: panels {_names(unclear)}"
+        )
+    if small:
+        refused.append(
+            f"{small} moves of the work list are less than {_MEANING:g} times their standard deviation (is_significant "
+            "0): they complete the plane of their panel"
+        )
     return WorkList(tuple(steps), tuple(refused))
+
+
+def _names(panels: Sequence[PanelId]) -> str:
+    names = [f"{panel.row}/{panel.col}" for panel in panels]
+    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
 
 
 class Made(StrEnum):

@@ -1,14 +1,21 @@
 """Alignment of the panels as data and text: um, urad; moves and deviations are positive towards the robot."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.core import FloatArray
+from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult
-from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, half_size_m, mirror_wavefront, rigid
+from ccatp.mirror.panel_alignment import (
+    MirrorWavefront,
+    PanelResult,
+    adjuster_places,
+    half_size_m,
+    mirror_wavefront,
+    rigid,
+)
 from ccatp.report.html import MICRO, render
 
 _DECIMALS = 4
@@ -23,6 +30,49 @@ def worst_corner(mirror: Mirror, panel: PanelResult) -> tuple[float, float]:
     values = modes @ panel.fit.values
     worst = int(np.argmax(np.abs(values)))
     return float(values[worst]), float(np.sqrt(modes[worst] @ panel.fit.covariance @ modes[worst]))
+
+
+class AdjusterPlaces(NamedTuple):
+    """Names of the adjusters of a panel, their (x, y) in its frame, mm, and a sentence that says what these axes are.
+
+    The places of all panels are the same within 0.1 mm.
+    """
+
+    names: tuple[str, ...]
+    places_mm: tuple[tuple[float, float], ...]
+    axes: str
+
+    @property
+    def heads(self) -> list[str]:
+        """Names with places, for the heads of columns."""
+        return [f"{name} ({x:.0f}, {y:.0f})" for name, (x, y) in zip(self.names, self.places_mm, strict=True)]
+
+
+def places_of(mirror: Mirror, panels: Iterable[PanelId]) -> AdjusterPlaces | None:
+    """Where the adjusters of panels are; None without a panel."""
+    for panel in panels:
+        names, places = adjuster_places(mirror, panel)
+        x_axis = mirror.mirror_from_deck(mirror.panel(panel).axes[0])
+        axes = (
+            f"x, y of the panel are {'-' if x_axis[0] < 0.0 else ''}x, y of the mirror frame: seen from the robot, "
+            "with y up, x is to the right; seen from behind the panel, to the left"
+        )
+        return AdjusterPlaces(names, tuple((round(1e3 * x, 1), round(1e3 * y, 1)) for x, y in places.tolist()), axes)
+    return None
+
+
+def undetermined_warnings(result: SurveyResult) -> list[str]:
+    """One line for the panels with points that do not determine them, by reason."""
+    whys = dict[str, list[str]]()
+    for one in result.undetermined:
+        if one.points:
+            whys.setdefault(one.why, []).append(f"{one.panel.row}/{one.panel.col}")
+    return [
+        f"panel{'s' if len(names) > 1 else ''} {', '.join(names[:_SHOWN])}"
+        + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+        + f" not determined: {why}"
+        for why, names in whys.items()
+    ]
 
 
 def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str, Any]:

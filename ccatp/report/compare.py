@@ -16,6 +16,7 @@ from ccatp.mirror.mirror_alignment import joint_covariance
 from ccatp.mirror.network_model import Effect
 from ccatp.mirror.network_points import CalibratedSurveys
 from ccatp.mirror.panel_alignment import PanelResult, mirror_wavefront
+from ccatp.report.alignment import places_of
 from ccatp.report.figures import distribution_figure, errors_figure, time_figure
 from ccatp.report.findings import KINDS, Findings, findings_of
 from ccatp.report.html import MICRO, Draw, events_of, inline, page_figures, render, write_pictures
@@ -232,7 +233,7 @@ def compare_page(pair: RunPair) -> str:
         changed=changed_keys(ours, others),
         points=[(earlier[verdict.point], verdict) for verdict in pair.b.points if verdict.point in earlier],
         surfaces=surfaces,
-        adjusters=next(iter((b or a).values())).adjusters if moved else (),
+        places=places_of(mirror, moved),
         moves=[(panel, a.get(panel), b.get(panel)) for panel in moved],
         events=[(letter, events_of(found.record.log)) for letter, found in pair.named if found.record.log],
     )

@@ -13,7 +13,7 @@ from ccatp.config.files import write_file
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
 from ccatp.records.run_reader import RunReadError
 from ccatp.report import figures
-from ccatp.report.alignment import worst_corner
+from ccatp.report.alignment import places_of, worst_corner
 from ccatp.report.findings import Findings, Grade, coverage_of, findings_of, observation_of
 from ccatp.report.html import MICRO, Draw, RunReport, environment, events_of, page_figures, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure
@@ -80,6 +80,7 @@ def run_page(found: Findings) -> str:
         never=Counter(verdict.why for verdict in found.points if verdict.grade is Grade.OPEN),
         panels=panels,
         bent=[panel for panel in fitted if panel.bending is not None and panel.explained.has_shape],
+        places=places_of(record.mirror, [panel.panel for panel in fitted]),
         worst=sorted(panels, key=lambda row: abs(row[2][0]), reverse=True)[:_FEW],
         few=_FEW,
         events=events_of(record.log),

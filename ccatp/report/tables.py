@@ -154,6 +154,12 @@ def panel_table(mirror: Mirror, panels: Sequence[PanelResult]) -> ColumnTable:
         "chi2": "chi-square of the fitted plane",
         "dof": "degrees of freedom of the fitted plane",
         "outliers": "numbers of the points that were not used for the fit",
+        **{
+            f"{name}_{axis}_m": f"place of adjuster {name} in the frame of the panel: x to the right, y up, seen "
+            "from the robot"
+            for name in names
+            for axis in "xy"
+        },
         **{f"{name}_um": f"move of adjuster {name}, > 0 towards the robot" for name in names},
         **{f"sigma_{name}_um": _SIGMA for name in names},
         **{f"bending_{name}_um": f"move of adjuster {name} that also removes twist and bowl" for name in names},
@@ -170,6 +176,8 @@ def panel_table(mirror: Mirror, panels: Sequence[PanelResult]) -> ColumnTable:
         data["outliers"] = _list(data["outliers"])
         data["is_bent"] = int(panel.shape is not None and panel.shape.is_significant)
         data |= zip([f"sigma_{name}" for name in _FIT], data["sigma"], strict=True)
+        for name, place in zip(*adjuster_places(mirror, panel.panel), strict=True):
+            data |= {f"{name}_{axis}_m": round(float(at), 6) for axis, at in zip("xy", place, strict=True)}
         data |= zip([f"{name}_um" for name in names], data["adjusters_um"], strict=True)
         data |= zip([f"sigma_{name}_um" for name in names], data["adjusters_sigma_um"], strict=True)
         if panel.bending is not None:
@@ -198,6 +206,7 @@ _WORK = {
     "move_um": "move of this step, > 0 towards the robot",
     "turns": "turns of the screw; empty if its pitch is not configured",
     "sigma_move_um": "standard deviation of the whole move",
+    "is_significant": "0: the whole move is less than three of its standard deviations",
 }
 
 
@@ -214,6 +223,7 @@ def work_table(steps: Sequence[Step]) -> ColumnTable:
             "move_um": round(1e6 * step.move_m, 4),
             "turns": None if step.turns is None else round(step.turns, 5),
             "sigma_move_um": round(1e6 * step.sigma_m, 4),
+            "is_significant": int(step.is_significant),
         }
         for step in steps
     ]

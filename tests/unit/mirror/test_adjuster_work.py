@@ -1,6 +1,7 @@
 """Work at the adjusters: steps within the limits, names in both orders, and what a later survey shows of the moves."""
 
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,6 +65,30 @@ def test_the_steps_add_up_to_the_moves_and_exceed_no_limit() -> None:
     assert [total[name] for name in BEFORE.adjusters] == pytest.approx(BEFORE.rigid.moves.values_m)
     places = {step.adjuster: (step.x_m, step.y_m) for step in steps}
     assert places["V1"] == pytest.approx((0.22, -0.25), abs=1e-6)
+
+
+def with_sigma(panel: PanelResult, sigma_m: float) -> PanelResult:
+    moves = panel.rigid.moves
+    wide = moves._replace(covariance_m2=np.eye(5) * sigma_m**2)
+    return replace(panel, rigid=panel.rigid._replace(moves=wide))
+
+
+def test_a_panel_without_a_move_above_the_noise_has_no_steps() -> None:
+    largest_m = float(np.abs(BEFORE.rigid.moves.values_m).max())
+    steps, (line,) = work_list(M1, AdjustersConfig(), [with_sigma(BEFORE, largest_m / 2.9)])
+    assert steps == ()
+    assert line.startswith("not in the work list, as no move is 3 times the largest standard deviation")
+    assert line.endswith("panels 4/5")
+    steps, lines = work_list(M1, AdjustersConfig(), [with_sigma(BEFORE, largest_m / 3.1)])
+    assert [step.is_significant for step in steps].count(True) == 1
+    assert "4 moves of the work list are less than 3 times their standard deviation" in lines[0]
+
+
+def test_a_panel_whose_points_do_not_decide_has_no_steps() -> None:
+    undecided = replace(BEFORE, deciding=M1.point_ids(PANEL)[0])
+    steps, (line,) = work_list(M1, AdjustersConfig(), [undecided])
+    assert steps == ()
+    assert line == "not in the work list, as their points do not decide: panels 4/5"
 
 
 def test_a_move_beyond_the_travel_is_named_and_not_in_the_list() -> None:
