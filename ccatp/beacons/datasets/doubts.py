@@ -9,9 +9,13 @@ from scipy.stats import binom, chi2
 
 from ccatp.beacons.cricket.map_fit import map_rms_m
 from ccatp.beacons.datasets.checks import STRANGER_M
-from ccatp.beacons.datasets.tables import instant
+from ccatp.beacons.datasets.mounting import robust_fit
+from ccatp.beacons.datasets.tables import instant, listed
+from ccatp.beacons.estimation.range_noise import correlations
 from ccatp.beacons.estimation.recording import EstimatedPath, KnownMap, RecordedRun
+from ccatp.beacons.estimation.track_review import range_residuals
 from ccatp.beacons.rigid_motion import aligned_rms_m
+from ccatp.core import FloatArray
 
 LEAST_BEACONS = 3  # of which most are as they should be
 MISSED = 5.0  # times the expected difference of map and survey, above which one of them is wrong
@@ -89,6 +93,62 @@ def map_doubts(track: EstimatedPath, known_map: KnownMap) -> list[str]:
 
 
 FEWEST = 20  # readings of a beacon
+CERTAIN = 5.0  # standard deviations of a known place and of the fit, beyond which another place is named
+LEAST_OFF_M = 0.05
+AS_FAR = 0.5  # of the place that is furthest off: a wrong one bends the path, and with it what fits the others
+
+
+def known_place_doubts(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -> Iterator[str]:
+    """A warning for each known place that its own ranges contradict, and one if the survey of the recording does.
+
+    The residual of a range is that of a place which is off by d: e = d u, with u from the radio to the beacon. So
+    e(u) gives d by a robust fit; errors that last for several readings count as fewer.
+    """
+    if run.known_map is None:
+        return
+    known, residuals_m = run.known_map, range_residuals(run, track, camera_field_rad)
+    r = run.readings
+    at = r.radios_at(track.poses_at(r.times_s))
+    off_m: dict[str, tuple[float, float, FloatArray]] = {}
+    for k, name in enumerate(known.names):
+        rows = (r.beacon == run.beacon_ids.index(name)) & np.isfinite(residuals_m)
+        if name not in track.beacons or rows.sum() < FEWEST:
+            continue
+        place = np.array(track.beacons[name][:2])
+        way = place - at[rows]
+        u = way / np.maximum(np.hypot(*way.T), 1e-3)[:, None]
+        d, _, sigmas = robust_fit(u, residuals_m[rows])
+        left_m = residuals_m[rows] - u @ d
+        likeness = float(np.clip(correlations(left_m)[1], 0.0, 0.99)) if left_m.any() else 0.0
+        lasting = (1.0 + likeness) / (1.0 - likeness)
+        variance = float(np.trace(known.covariance_m2[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]))
+        fits = place + d
+        far_m = float(np.hypot(*(fits - known.places_m[k])))
+        if far_m > max(CERTAIN * np.sqrt(variance + lasting * float(sigmas @ sigmas)), LEAST_OFF_M):
+            off_m[name] = far_m, float(np.sqrt(0.5 * variance)), fits
+    furthest_m = max((far_m for far_m, *_ in off_m.values()), default=0.0)
+    for name, (far_m, sigma_m, fits) in off_m.items():
+        if far_m >= AS_FAR * furthest_m:
+            yield (
+                f"ranges of beacon {name} fit the place ({fits[0]:.2f}, {fits[1]:.2f}), {far_m:.2g} m from the known "
+                f"one, whose standard deviation is {sigma_m:.2g} m: is the map wrong there, or are they reflections?"
+            )
+
+
+def map_against_survey(known: KnownMap, surveyed_m: Mapping[str, tuple[float, float]]) -> list[str]:
+    """A warning if the places of a known map are not those of the survey of the recording."""
+    differ_m = {}
+    for k, name in enumerate(known.names):
+        sigma_m = float(np.sqrt(np.trace(known.covariance_m2[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])))
+        far_m = float(np.hypot(*(known.places_m[k] - surveyed_m.get(name, known.places_m[k]))))
+        if far_m > max(CERTAIN * sigma_m, LEAST_OFF_M):
+            differ_m[name] = far_m
+    if not differ_m:
+        return []
+    which = listed([f"{name} by {far_m:.2g} m" for name, far_m in differ_m.items()])
+    return [f"the known map and the survey of the recording differ: {which}"]
+
+
 STRAY = 5.0  # times the usual miss of the beacons
 
 

@@ -62,16 +62,16 @@ def _better_place(way: FloatArray, heading_rad: FloatArray, range_m: FloatArray)
     u, v = (way / far_m[:, None]).T
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     calibration = np.column_stack([np.ones(far_m.size), far_m])
-    _, misfit_m, _ = _fitted(calibration, range_m - far_m)
+    _, misfit_m, _ = robust_fit(calibration, range_m - far_m)
     arms = np.column_stack([-(c * u + s * v), -(c * v - s * u), calibration])
-    found, better_m, sigmas = _fitted(arms, range_m - far_m)
+    found, better_m, sigmas = robust_fit(arms, range_m - far_m)
     far = np.hypot(*found[:2])
     if far < LEAST_ARM_M or better_m > BETTER * misfit_m or far < SURE * np.hypot(*sigmas[:2]):
         return None
     return found[:2]
 
 
-def _fitted(H: FloatArray, e: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+def robust_fit(H: FloatArray, e: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     """Terms of a fit with Cauchy's weights, the median of its absolute residuals, and standard errors of the terms."""
     weights, found, scale = np.ones(e.size), np.zeros(H.shape[1]), 0.0
     spread: FloatArray = np.eye(H.shape[1])

@@ -32,15 +32,29 @@ from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.core import FloatArray
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported
+BOTH_SCALES = ("distance_scale", "range_scale")
+TOGETHER = 0.5  # of the larger scale is in the other one, too
 UNCHANGED = 0.999  # share of the prior's standard deviation above which a value counts as not determined by readings
 
 
 def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, float], kind: str) -> Iterator[str]:
-    """A warning for each value that is more than FAR standard deviations from zero, the mean of its prior."""
+    """A warning for each value that is more than FAR standard deviations from zero, the mean of its prior.
+
+    If both scales have grown together, the readings do not tell the size of the map: a wider prior is no remedy.
+    """
+    by, longer = (calibration[name].value if name in calibration else 0.0 for name in BOTH_SCALES)
+    together = by * longer > 0.0 and min(abs(by), abs(longer)) > TOGETHER * max(abs(by), abs(longer))
+    far = [name for name, (value, _) in calibration.items() if abs(value) > FAR * priors.get(name, np.inf)]
+    if together and {*far} & {*BOTH_SCALES}:
+        yield (
+            f"distance_scale and range_scale grow together, to {by:+.3g} and {longer:+.3g}: the readings do not tell "
+            "them apart, and the map may have this error of its size. Do not widen their priors; narrow those in "
+            f"{kind}.priors of the scale that is known better, and look for ranges that are too long"
+        )
     for name, (value, _) in calibration.items():
         key = name if name in priors else HEIGHT_M2  # of one beacon
         sigma = priors[key]
-        if abs(value) > FAR * sigma:
+        if abs(value) > FAR * sigma and not (together and name in BOTH_SCALES):
             yield (
                 f"{name} comes out as {value:+.3g}, {abs(value) / sigma:.1f} standard deviations of its prior: "
                 f"if that can be, widen {kind}.priors.{key} (now {sigma:g})"

@@ -6,13 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.estimation.range_noise import FEWEST, correlations
+from ccatp.beacons.estimation.range_noise import FEWEST, correlations, readings_as_one
 from ccatp.beacons.estimation.recording import EstimatedPath, Readings, RecordedRun, dead_reckoned
 from ccatp.beacons.rigid_motion import best_motion
 from ccatp.core import FloatArray
 
 _MOST = 0.999
 _NEAR_M, _FLAT = 1e-3, 1e-6
+_BY_CHANCE = 3.0  # standard errors
+_LEAST_SHARE = 0.02  # of the error, below which a difference does not matter
 _CLIPPED = 3.0  # medians at which errors are cut off: a few outliers must not decide
 
 
@@ -31,6 +33,7 @@ class Predictions(NamedTuple):
     horizon_s: float  # after which the next two are predicted: errors that last help the estimate with the next range
     estimate_later_m: float  # mean absolute error, each beacon where it fits best
     reckoned_later_m: float  # the same from dead reckoning alone
+    difference_sigma_m: float  # standard error of the difference of the last two, of errors that last
 
 
 def predicted(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -> Predictions | None:
@@ -53,7 +56,11 @@ def predicted(run: RecordedRun, track: EstimatedPath, camera_field_rad: float) -
     if len(later.times_s) < FEWEST:
         later, horizon_s = r, 0.0
     fitted = [_errors(later, at, _fitted(later, at, places)) for at in _ahead(run, track, reckoned, later, horizon_s)]
-    return Predictions(_size(own_m), _size(reckoned_m), correlation, horizon_s, *map(_size, fitted))
+    own_later_m, reckoned_later_m = map(_clipped, fitted)
+    return Predictions(
+        _size(own_m), _size(reckoned_m), correlation, horizon_s, float(own_later_m.mean()),
+        float(reckoned_later_m.mean()), _standard_error(own_later_m - reckoned_later_m),
+    )  # fmt: skip
 
 
 def _ahead(
@@ -97,12 +104,15 @@ def _fitted(r: Readings, at: FloatArray, places: FloatArray) -> FloatArray:
 
 
 def prediction_doubts(found: Predictions | None) -> Iterator[str]:
-    """A warning if dead reckoning predicts the readings better."""
-    if found is not None and found.estimate_later_m > found.reckoned_later_m:
+    """A warning if dead reckoning predicts the readings better, and not by chance."""
+    if found is None:
+        return
+    by_m = found.estimate_later_m - found.reckoned_later_m
+    if by_m > max(_BY_CHANCE * found.difference_sigma_m, _LEAST_SHARE * found.reckoned_later_m):
         after = f" {found.horizon_s:.1f} s later" if found.horizon_s > 0.0 else ""
         yield (
-            f"the estimate predicts its ranges{after} to {found.estimate_later_m:.2f} m, dead reckoning on its own "
-            f"map to {found.reckoned_later_m:.2f} m: heights, an antenna off the vehicle's middle, reflections, or a "
+            f"the estimate predicts its ranges{after} to {found.estimate_later_m:.3g} m, dead reckoning on its own "
+            f"map to {found.reckoned_later_m:.3g} m: heights, an antenna off the vehicle's middle, reflections, or a "
             "wrong map?"
         )
 
@@ -126,8 +136,20 @@ def _poses_at(at_s: FloatArray, times_s: FloatArray, poses: FloatArray) -> Float
 
 
 def _size(errors_m: FloatArray) -> float:
+    return float(_clipped(errors_m).mean())
+
+
+def _clipped(errors_m: FloatArray) -> FloatArray:
     off_m = np.abs(errors_m)
-    return float(np.minimum(off_m, _CLIPPED * np.median(off_m)).mean())
+    return np.asarray(np.minimum(off_m, _CLIPPED * np.median(off_m)))
+
+
+def _standard_error(values: FloatArray) -> float:
+    """Of the mean of values in order of time, which are correlated."""
+    off = values - values.mean()
+    if not off.any():
+        return 0.0
+    return float(np.sqrt(np.mean(off**2) * readings_as_one(correlations(off)) / off.size))
 
 
 def _correlation(errors_m: FloatArray, r: Readings) -> tuple[float | None, float]:

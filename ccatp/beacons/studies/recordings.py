@@ -16,7 +16,14 @@ import numpy as np
 from ccatp.beacons.config.load import load_radio_config
 from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.cricket.measured_map import map_measured
-from ccatp.beacons.datasets.doubts import map_doubts, stray_beacons, sudden_disagreement, survey_doubts
+from ccatp.beacons.datasets.doubts import (
+    known_place_doubts,
+    map_against_survey,
+    map_doubts,
+    stray_beacons,
+    sudden_disagreement,
+    survey_doubts,
+)
 from ccatp.beacons.datasets.mounting import radio_doubts
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
 from ccatp.beacons.datasets.tables import RadioDataError
@@ -70,7 +77,9 @@ def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> E
         ) from error
     surveyed = survey_doubts(track, run.beacon_truth_m) if run.truth is None else []
     if run.known_map is not None:
-        surveyed += map_doubts(track, run.known_map)
+        # Where the estimate follows its readings, the wrong place has bent it, and with it what fits the others.
+        surveyed += map_doubts(track, run.known_map) or known_place_doubts(run, track, cfg.radio.camera_field_rad)
+        surveyed += map_against_survey(run.known_map, run.beacon_truth_m)
     surveyed += radio_doubts(run, track)
     doubts = prediction_doubts(predicted(run, track, cfg.radio.camera_field_rad))
     return track._replace(

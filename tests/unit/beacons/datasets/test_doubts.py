@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
-from ccatp.beacons.datasets.doubts import map_doubts, stray_beacons, sudden_disagreement, survey_doubts
+from ccatp.beacons.datasets.doubts import (
+    known_place_doubts,
+    map_against_survey,
+    map_doubts,
+    stray_beacons,
+    sudden_disagreement,
+    survey_doubts,
+)
 from ccatp.beacons.estimation.causal import filter_run
 from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, KnownMap, ReadingInnovation, RecordedRun
 from tests.unit.beacons.datasets.sets import BEACONS, recorded, world
@@ -85,6 +92,25 @@ def test_a_map_that_the_readings_move_too_far_is_doubted(sigmas: float, is_doubt
         assert "about 0.06 m would fit" in said[0]
     assert map_doubts(track_of(fixes, before), known) == []  # readings that say nothing of the places
     assert map_doubts(track_of({}, np.zeros((0, 0))), known) == []
+
+
+@pytest.mark.parametrize("off_m", [(0.4, 0.0), (0.0, -0.4)])
+def test_a_wrong_known_place_is_named_though_its_readings_do_not_move_it(off_m: tuple[float, float]) -> None:
+    surveyed = {**BEACONS, "6": (BEACONS["6"][0] + off_m[0], BEACONS["6"][1] + off_m[1])}
+    known = KnownMap(tuple(surveyed), np.array(list(surveyed.values())), 0.02**2 * np.eye(8), np.full(4, np.nan))
+    fixes = {name: BeaconFix(x, y, 0.02**2 * np.eye(2)) for name, (x, y) in surveyed.items()}
+    covariances = np.broadcast_to(1e-4 * np.eye(3), (len(W.poses), 3, 3))
+    track = EstimatedPath(W.times_s, W.poses, covariances, fixes, {}, 0, 0, (), map_covariance=0.02**2 * np.eye(8))
+    run = replace(SOUND, beacon_ids=tuple(BEACONS), known_map=known)
+    (line,) = known_place_doubts(run, track, 0.0)
+    assert line.startswith("ranges of beacon 6 fit the place (0.")
+    assert float(line.split("), ")[1].split()[0]) == pytest.approx(0.4, abs=0.03)
+    assert map_against_survey(known, BEACONS) == ["the known map and the survey of the recording differ: 6 by 0.4 m"]
+    right = replace(run, known_map=known._replace(places_m=np.array(list(BEACONS.values()))))
+    sound = track._replace(beacons={name: BeaconFix(x, y, fixes[name].covariance) for name, (x, y) in BEACONS.items()})
+    assert list(known_place_doubts(right, sound, 0.0)) == []
+    assert map_against_survey(known, {}) == []
+    assert list(known_place_doubts(SOUND, track, 0.0)) == []
 
 
 def track_of(fixes: dict[str, BeaconFix], covariance: np.ndarray) -> EstimatedPath:

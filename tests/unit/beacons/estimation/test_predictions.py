@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
+from ccatp.beacons.estimation.causal import beyond_priors
 from ccatp.beacons.estimation.predictions import predicted, prediction_doubts, prediction_lines
+from ccatp.beacons.estimation.recording import Calibrated
 from ccatp.beacons.studies.recordings import estimate
 from ccatp.beacons.studies.trait_runs import trait_run
 
@@ -41,6 +43,34 @@ def test_an_estimate_that_dead_reckoning_beats_gives_a_warning() -> None:
     lost = track._replace(poses=track.poses + wander * (1.0, 1.0, 0.0))
     (warning,) = prediction_doubts(predicted(run, lost, 0.0))
     assert "dead reckoning on its own map" in warning
+
+
+def test_a_difference_by_chance_gives_no_warning() -> None:
+    run = trait_run([], 2)
+    found = predicted(run, estimate(run, CONFIG, "fixed-lag"), 0.0)
+    assert found is not None
+    near = found._replace(reckoned_later_m=0.070, difference_sigma_m=0.002)
+    assert not list(prediction_doubts(near._replace(estimate_later_m=0.075)))
+    assert not list(prediction_doubts(near._replace(estimate_later_m=0.0711, difference_sigma_m=0.0)))
+    (warning,) = prediction_doubts(near._replace(estimate_later_m=0.0771))
+    assert "to 0.0771 m, dead reckoning on its own map to 0.07 m" in warning
+
+
+def test_scales_that_grow_together_are_not_to_be_given_a_wider_prior() -> None:
+    priors = {"distance_scale": 0.02, "range_scale": 0.05}
+
+    def said(distance_scale: float, range_scale: float) -> list[str]:
+        values = {"distance_scale": distance_scale, "range_scale": range_scale}
+        return list(beyond_priors({name: Calibrated(value, 0.01) for name, value in values.items()}, priors, "csv"))
+
+    (line,) = said(0.165, 0.167)
+    assert "grow together, to +0.165 and +0.167" in line
+    assert "Do not widen" in line
+    (line,) = said(0.165, 0.01)
+    assert "widen csv.priors.distance_scale" in line
+    (line,) = said(0.01, -0.2)
+    assert "widen csv.priors.range_scale" in line
+    assert said(0.01, 0.01) == []
 
 
 def test_too_few_ranges_say_nothing() -> None:
