@@ -1,6 +1,7 @@
 """``ccatp align --points``: the alignment of points that another instrument measured."""
 
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -66,7 +67,7 @@ class AlignedPoints(NamedTuple):
     @property
     def lines(self) -> list[str]:
         """What the points show of themselves, a line each."""
-        lines = [f"{len(self.assigned.measured)} targets on {len(self.result.panels)} panels that could be fitted"]
+        lines = [f"{len(self.assigned.labels)} targets on {len(self.result.panels)} panels that could be fitted"]
         if self.fitted is not None:
             residual_um = 1e6 * float(np.sqrt(np.mean(self.fitted.residuals_m**2)))
             lengths_um = 1e6 * np.linalg.norm(self.fitted.residuals_m, axis=1)
@@ -94,6 +95,8 @@ class AlignedPoints(NamedTuple):
                     f"the readings of a panel are shifted together by {1e6 * repeats.shift_m:.1f} um from one to the "
                     "next: two nights, or two frames; align each on its own. All panels share the uncertainty"
                 )
+        if self.assigned.contradictions:
+            lines.append(self._contradictions)
         if self.assigned.copies:
             lines.append(f"{self.assigned.copies} readings are copies of others to the last digit, and count once")
         if self.assigned.by_position:
@@ -111,6 +114,29 @@ class AlignedPoints(NamedTuple):
         return lines
 
     @property
+    def _contradictions(self) -> str:
+        """Points whose readings contradict each other, and which of these readings are not used."""
+        unused = defaultdict[PointId, list[int]](list)
+        lines = defaultdict[PointId, list[int]](list)
+        for one in self.assigned.measured:
+            lines[one.point].append(round(one.fix.t_s))
+        for panel in self.result.panels:
+            own = iter([line for point in sorted(set(panel.deviations.points)) for line in lines[point]])
+            for point, line, kept in zip(panel.deviations.points, own, panel.is_kept, strict=True):
+                if not kept:
+                    unused[point].append(line)
+        found = self.assigned.contradictions
+        names = [
+            f"{'/'.join(map(str, point))} by {1e6 * range_m:.1f} um (lines {', '.join(map(str, lines[point]))}; "
+            f"{'not used: ' + ', '.join(map(str, unused[point])) if unused[point] else 'all used'})"
+            for point, range_m in found.items()
+        ]
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        return (
+            f"readings of a point contradict each other, and each counts on its own: {', '.join(names[:_NAMED])}{more}"
+        )
+
+    @property
     def _mentioned(self) -> list[PointId]:
         """Points that warnings name."""
         found = [
@@ -125,13 +151,17 @@ class AlignedPoints(NamedTuple):
         """The same for ``--json``."""
         assigned, fitted, repeats = self.assigned, self.fitted, self.assigned.repeats
         return {
-            "targets": len(assigned.measured),
+            "targets": len(assigned.labels),
             "sigma_factor": round(self.factor, 4),
             "repeated": repeats.readings if repeats else 0,
             "repeat_sigma_um": repeats and round(1e6 * repeats.sigma_m, 4),
             "claimed_sigma_um": round(1e6 * repeats.claimed_m, 4) if repeats else 0.0,
             "repeat_shift_um": repeats and round(1e6 * repeats.shift_m, 4),
             "reference_residuals_um": fitted and (1e6 * fitted.residuals_m).round(4).tolist(),
+            "contradictions": [
+                {**point._asdict(), "range_um": round(1e6 * range_m, 4)}
+                for point, range_m in assigned.contradictions.items()
+            ],
             "off_height": [
                 {
                     "off_um": round(1e6 * one.off_m, 1),
@@ -177,7 +207,7 @@ def align_points(run_dir: Path | None, settings: Mapping[str, object], options: 
     measured = tuple(_scaled(one, 1.0 if repeats is None else repeats.excess) for one in assigned.measured)
     planned = {one.point.panel for one in measured}
     shared = _shared(assigned, points, common_errors)
-    result = survey_result(mirror, cfg.align, options.offset_m, measured, planned, shared)
+    result = survey_result(mirror, cfg.align, options.offset_m, measured, planned, shared, assigned.readings)
     figure = common_figure(mirror, result, cfg.align.false_alarm)
     return AlignedPoints(cfg, mirror, assigned, result, fitted, figure)
 

@@ -6,7 +6,7 @@ from itertools import permutations, product
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import chdtri, fdtrc
 
 from ccatp.core import BoolArray, Fix, FloatArray, Measured, PanelId, PointId, Vector3
 from ccatp.errors import UsageError
@@ -174,7 +174,9 @@ class Assigned(NamedTuple):
     ``by_position``: readings whose label names no panel. ``copies``: copies of others to the last digit,
     which count once. ``row_first``: names of the observatory have the row first.
     ``shifts`` (3, 1) of each point: the error of the mean that all points share by shifts between readings.
-    ``off_height``: points too high or too low by millimetres, together if by the same.
+    ``off_height``: points too high or too low by millimetres, together if by the same. ``contradictions``: points whose
+    readings contradict each other, with their range along the normal, m; each of these readings is measured on its own.
+    ``readings``: of which a measured point is the mean.
     """
 
     measured: tuple[Measured, ...]
@@ -185,6 +187,29 @@ class Assigned(NamedTuple):
     repeats: Repeats | None
     shifts: Mapping[PointId, FloatArray]
     off_height: tuple[OffHeight, ...]
+    contradictions: Mapping[PointId, float]
+    readings: Mapping[PointId, int]
+
+
+class _Target(NamedTuple):
+    """A target with its readings: rows of the file, places (k, 3), mean covariance of one, normal of the panel."""
+
+    point: PointId
+    rows: Sequence[int]
+    places_m: FloatArray
+    covariance_m2: FloatArray
+    normal: FloatArray
+
+    @property
+    def along_m(self) -> FloatArray:
+        """Readings along the normal without their mean, (k,)."""
+        along = self.places_m @ self.normal
+        return np.asarray(along - along.mean())
+
+    @property
+    def claimed_m2(self) -> float:
+        """Claimed variance of a reading along the normal."""
+        return float(self.normal @ self.covariance_m2 @ self.normal)
 
 
 def check_on_mirror(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float) -> FloatArray:
@@ -253,51 +278,48 @@ def _why_far(mirror: Mirror, points: Sequence[ForeignPoint], world: FloatArray, 
 
 
 def assign(mirror: Mirror, points: Sequence[ForeignPoint], offset_m: float, false_alarm: float) -> Assigned:
-    """Points as measured points of their panels, by label or position; repeated readings become one point."""
+    """Points as measured points of their panels, by label or position; readings that agree become one point."""
     feet = check_on_mirror(mirror, points, offset_m)
     there = [mirror.grid.nearest_panel(x, y) for x, y, _ in feet.tolist()]
     named, row_first = _named(mirror, points, there)
     by_panel: dict[PanelId, list[int]] = defaultdict(list)
     for at, panel in enumerate(there):
         by_panel[panel].append(at)
-    measured, labels, normals = list[Measured](), dict[PointId, str](), dict[PointId, tuple[FloatArray, int]]()
-    readings = list[list[FloatArray]]()
-    claimed = list[float]()
-    above = dict[PointId, float]()
-    copies = 0
+    targets, copies = list[_Target](), 0
     for panel, rows in sorted(by_panel.items()):
         own = {points[at].place_m: at for at in reversed(rows)}
         copies += len(rows) - len(own)
-        targets = _targets(points, sorted(own.values()))
-        readings.append([])
         normal = np.array(mirror.rotate_world_from_deck(mirror.panel(panel).axes[2]))
-        for number, same in zip(_numbers(points, targets), targets, strict=True):
+        groups = _targets(points, sorted(own.values()))
+        for number, same in zip(_numbers(points, groups), groups, strict=True):
             places = np.array([points[at].place_m for at in same])
             covariance = np.mean([points[at].covariance_m2 for at in same], axis=0)
-            readings[-1].append(places @ normal)
-            claimed += [float(normal @ covariance @ normal)] * (len(same) - 1)
-            point = PointId(panel.row, panel.col, number)
-            x, y, z = places.mean(axis=0).tolist()
-            fix = Fix(
-                float(points[same[0]].line), (x, y, z), tuple((covariance / len(same)).ravel().tolist()), 0.0, (), 0.0
-            )
-            measured.append(Measured(point, fix))
-            labels[point] = points[same[0]].label
-            above[point] = float(np.mean(feet[same, 2])) - offset_m
-            normals[point] = normal, len(same)
-    repeats = _repeats(readings, claimed, false_alarm) if claimed else None
+            targets.append(_Target(PointId(panel.row, panel.col, number), same, places, covariance, normal))
+    contradictions = _contradictions(targets, false_alarm)
+    repeats = _repeats([one for one in targets if one.point not in contradictions], false_alarm)
     shift_m = 0.0 if repeats is None else repeats.shift_m
+    measured, shifts, readings = list[Measured](), dict[PointId, FloatArray](), dict[PointId, int]()
+    for one in targets:
+        parts = [[k] for k in range(len(one.rows))] if one.point in contradictions else [[*range(len(one.rows))]]
+        readings[one.point] = len(parts[0])
+        for part in parts:
+            x, y, z = one.places_m[part].mean(axis=0).tolist()
+            covariance = tuple((one.covariance_m2 / len(part)).ravel().tolist())
+            fix = Fix(float(points[one.rows[part[0]]].line), (x, y, z), covariance, 0.0, (), 0.0)
+            measured.append(Measured(one.point, fix))
+        if shift_m:
+            shifts[one.point] = shift_m / np.sqrt(len(parts[0])) * one.normal[:, None]
     return Assigned(
         tuple(measured),
-        labels,
+        {one.point: points[one.rows[0]].label for one in targets},
         by_position=sum(panel is None for panel in named),
         copies=copies,
         row_first=row_first,
         repeats=repeats,
-        shifts={
-            point: shift_m / np.sqrt(count) * normal[:, None] for point, (normal, count) in normals.items() if shift_m
-        },
-        off_height=_off_height(above),
+        shifts=shifts,
+        off_height=_off_height({one.point: float(np.mean(feet[one.rows, 2])) - offset_m for one in targets}),
+        contradictions=contradictions,
+        readings=readings,
     )
 
 
@@ -347,21 +369,59 @@ def _named(
     raise problems[0]
 
 
-def _repeats(readings: Sequence[Sequence[FloatArray]], claimed: Sequence[float], false_alarm: float) -> Repeats:
+def _of_panels(targets: Sequence[_Target]) -> list[list[_Target]]:
+    """Targets with the same number of repeated readings on a panel together."""
+    found = defaultdict[tuple[PanelId, int], list[_Target]](list)
+    for one in targets:
+        if len(one.rows) > 1:
+            found[one.point.panel, len(one.rows)].append(one)
+    return [*found.values()]
+
+
+def _contradictions(targets: Sequence[_Target], false_alarm: float) -> dict[PointId, float]:
+    """Targets whose readings differ by more than noise makes them, with the range along the normal, m.
+
+    Shifts of all readings of a panel from one to the next are none. If most targets are repeated, their median says
+    how much readings scatter. If few are, they may have been repeated because they seemed wrong, and do not say it.
+    """
+    left = dict[PointId, FloatArray]()
+    for some in _of_panels(targets):
+        table = np.array([one.along_m for one in some])
+        if len(table) >= _REPEATS:
+            table -= np.median(table, axis=0)
+        left |= {one.point: row for one, row in zip(some, table, strict=True)}
+    repeated = [one for one in targets if one.point in left]
+    variance = 1.0
+    if len(repeated) >= max(_REPEATS, len(targets) / 2):
+        squares = np.array([np.sum((left[one.point] - left[one.point].mean()) ** 2) for one in repeated])
+        usual = np.array([one.claimed_m2 * chdtri(len(one.rows) - 1, 0.5) for one in repeated])
+        variance = max(1.0, float(np.median(squares / usual)))
+    pairs = sum(len(one.rows) - 1 for one in repeated)
+    limit = variance * float(chdtri(1, false_alarm / max(pairs, 1)))
+    return {
+        one.point: float(np.ptp(one.along_m))
+        for one in repeated
+        if np.ptp(left[one.point]) ** 2 > 2.0 * limit * one.claimed_m2
+    }
+
+
+def _repeats(targets: Sequence[_Target], false_alarm: float) -> Repeats | None:
     """Analysis of variance of the repeated readings of each panel's targets, m, by target and order of reading.
 
     A night or an instrument that differs from the other shifts all its readings alike: their mean is not better by
-    the number of the points.
+    the number of the points. None without repeated readings.
     """
+    claimed = [one.claimed_m2 for one in targets for _ in one.rows[1:]]
+    if not claimed:
+        return None
     own = np.zeros(2)  # sum of squares, degrees of freedom
     shifts, sizes = np.zeros(2), list[int]()
-    for targets in readings:
-        for count in {len(one) for one in targets} - {1}:
-            table = np.array([one - one.mean() for one in targets if len(one) == count])
-            means = table.mean(axis=0)
-            own += float(np.sum((table - means) ** 2)), (count - 1) * (len(table) - 1)
-            shifts += len(table) * float(means @ means), count - 1
-            sizes += [len(table)] * (count - 1)
+    for some in _of_panels(targets):
+        table = np.array([one.along_m for one in some])
+        count, means = table.shape[1], table.mean(axis=0)
+        own += float(np.sum((table - means) ** 2)), (count - 1) * (len(table) - 1)
+        shifts += len(table) * float(means @ means), count - 1
+        sizes += [len(table)] * (count - 1)
     total, dof = own + shifts
     if own[1] > 0 and own[0] > 0.0:
         variances = own[0] / own[1], shifts[0] / shifts[1]

@@ -94,10 +94,12 @@ def survey_result(
     measured: Iterable[Measured],
     planned: Iterable[PanelId],
     common: Mapping[PointId, FloatArray] | None = None,
+    readings: Mapping[PointId, int] | None = None,
 ) -> SurveyResult:
     """Fit every panel; a ``planned`` panel without enough fixes is listed as undetermined.
 
-    ``common``: errors of the points that panels share, as of ``network_points.CommonErrors``.
+    ``common``: errors of the points that panels share, as of ``network_points.CommonErrors``. ``readings``: of which a
+    fix is the mean.
     """
     warnings: list[str] = []
     by_panel: dict[PanelId, list[Measured]] = {panel: [] for panel in sorted(set(planned))}
@@ -106,7 +108,7 @@ def survey_result(
     usable: dict[PanelId, Deviations] = {}
     undetermined = []
     for panel, some in by_panel.items():
-        deviations, why = _deviations(mirror, cfg, puck_height_m, panel, some, common)
+        deviations, why = _deviations(mirror, cfg, puck_height_m, panel, some, common, readings)
         if deviations is None:
             undetermined.append(Undetermined(panel, len(some), why))
         else:
@@ -182,6 +184,7 @@ def _deviations(
     panel: PanelId,
     measured: Sequence[Measured],
     common: Mapping[PointId, FloatArray] | None,
+    readings: Mapping[PointId, int] | None,
 ) -> tuple[Deviations | None, str]:
     """Deviations that can be fitted, or None and the reason."""
     reliable = [one for one in measured if one.fix.metrology != UNRELIABLE]
@@ -194,7 +197,7 @@ def _deviations(
     if len(measured) < ENOUGH:
         return None, f"{len(measured)} of {ENOUGH} points that it takes"
     try:
-        found = deviations_of(mirror, panel, measured, puck_height_m, cfg.point_floor_m, common)
+        found = deviations_of(mirror, panel, measured, puck_height_m, cfg.point_floor_m, common, readings)
     except ConvergenceError as error:
         return None, f"a fix is far from the mirror: {error}"
     if not (found.sigmas_m > 0.0).all():
@@ -223,8 +226,14 @@ def _remarks(result: PanelResult) -> list[str]:
             f"difference; measure {where_again} again, which decides"
         )
     elif result.outliers:
-        names = ", ".join(f"{row}/{col}/{number}" for row, col, number in result.outliers)
-        lines.append(f"{where}: not used, because they are outliers: {names}; measure them again")
+        kept = {point for point, used in zip(result.deviations.points, result.is_kept, strict=True) if used}
+        names = [
+            f"{result.panel.row}/{result.panel.col}/{name}"
+            for name, used in zip(result.deviations.names, result.is_kept, strict=True)
+            if not used
+        ]
+        again = "; measure them again" if set(result.outliers) - kept else ""
+        lines.append(f"{where}: not used, because they are outliers: {', '.join(names)}{again}")
     if result.sigma_factor > 1.0:
         lines.append(
             f"{where}: its points contradict each other by more than they are uncertain (chance "
@@ -242,8 +251,8 @@ def joint_covariance(panels: Sequence[PanelResult], errors: slice = slice(None))
 
 def _explained(result: PanelResult, one: Explanation) -> str:
     """An explanation in words: which points are wrong, and whether the panel is bent."""
-    points = result.deviations.points
-    wrong = " and ".join(str(point.point) for point, kept in zip(points, one.is_kept, strict=True) if not kept)
+    names = result.deviations.names
+    wrong = " and ".join(name for name, kept in zip(names, one.is_kept, strict=True) if not kept)
     parts = ["a bent panel"] if one.has_shape else []
     return " with ".join([*parts, *([f"wrong points {wrong}"] if wrong else [])])
 

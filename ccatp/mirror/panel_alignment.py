@@ -8,7 +8,7 @@ twist and bowl, which five adjusters can change. The method is in docs/align.md.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from math import exp, sqrt
+from math import comb, exp, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,8 @@ class Deviations(NamedTuple):
     (k,) the deviations along the local normal, > 0 towards the robot. ``lever`` (k,): scalar product of the local and
     the panel's normal, the deviation per displacement D along the panel's normal. ``common`` (k, r): change of the
     deviations per independent error of standard deviation 1 that they share with other panels, not part of the sigmas.
+    ``readings`` (k,): of which each is the mean; None if of one. A point whose readings contradict each other is there
+    once for each reading.
     """
 
     points: tuple[PointId, ...]
@@ -37,6 +39,23 @@ class Deviations(NamedTuple):
     lever: FloatArray
     metrology: tuple[str, ...] = ()
     common: FloatArray | None = None
+    readings: FloatArray | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The numbers of the points; of those that are there more than once with the number of the reading."""
+        numbers = [point.point for point in self.points]
+        return tuple(
+            f"{number} (reading {numbers[:at].count(number) + 1})" if numbers.count(number) > 1 else str(number)
+            for at, number in enumerate(numbers)
+        )
+
+    @property
+    def extra_readings(self) -> FloatArray:
+        """How many more readings than usual each point is the mean of, (k,)."""
+        if self.readings is None:
+            return np.zeros(len(self.points))
+        return np.asarray(np.maximum(self.readings - np.median(self.readings), 0.0))
 
     def scaled(self, factor: float) -> "Deviations":
         """With ``factor`` times the sigmas."""
@@ -50,11 +69,13 @@ def deviations_of(
     puck_height_m: float,
     floor_m: float,
     common: Mapping[PointId, FloatArray] | None = None,
+    readings: Mapping[PointId, int] | None = None,
 ) -> Deviations:
     """Deviations of the points of a panel; their variance is ``n^T C n + floor^2``.
 
     A lateral error of the fix only moves the point along the surface. ``floor_m``: independent error of each point that
-    the covariance of its fix does not include. ``common``: errors of the points, (3, r), world frame.
+    the covariance of its fix does not include. ``common``: errors of the points, (3, r), world frame. ``readings``: of
+    which a fix is the mean.
 
     Raises ``UnknownPanelError``, ``ConvergenceError`` far from the mirror.
     """
@@ -81,6 +102,7 @@ def deviations_of(
         lever=np.array(normals) @ np.array(body.axes[2]),
         metrology=tuple(one.fix.metrology for one in chosen),
         common=shared,
+        readings=None if readings is None else np.array([readings.get(one.point, 1) for one in chosen], np.float64),
     )
 
 
@@ -256,6 +278,7 @@ _CURVATURES = 3
 REDUNDANCY = 3
 # Points that are left out at most, and number of points from which it is one: the selections are tried one by one.
 _MOST_LEFT_OUT, _MANY = 2, 20
+_MOST_SELECTIONS = 2000  # of as many points, which take a tenth of a second
 
 
 class Prices(NamedTuple):
@@ -281,6 +304,7 @@ class Explanation(NamedTuple):
     is_kept: BoolArray
     has_shape: bool
     cost: float
+    chi2: float = np.inf
 
     @property
     def is_plain(self) -> bool:
@@ -300,8 +324,10 @@ def explain(deviations: Deviations, price: Prices) -> tuple[Explanation, ...]:
     """All explanations of a panel's deviations that the points do not exclude, the cheapest first.
 
     All points are kept if the panel cannot be fitted, or has too few redundant points. A plain panel has no others.
+    A point that is the mean of more readings than others costs as many points: all of them would have to be wrong.
     """
     count = len(deviations.points)
+    cost_of_point = price.outlier * (1.0 + deviations.extra_readings)
     target = deviations.values_m / deviations.sigmas_m
     found, lowest = list[Explanation](), np.inf
     for modes, needed in ((rigid, 3), (quadratic, 6)):
@@ -309,18 +335,31 @@ def explain(deviations: Deviations, price: Prices) -> tuple[Explanation, ...]:
         extra = price.shape if has_shape else 0.0
         whitened = modes(deviations.places_m) * (deviations.lever / deviations.sigmas_m)[:, None]
         whitened /= np.linalg.norm(whitened, axis=0)
-        for is_kept in _subsets(count, min((count - needed) // REDUNDANCY, _MOST_LEFT_OUT if count <= _MANY else 1)):
-            cost = extra + price.outlier * int(np.count_nonzero(~is_kept))
+        for is_kept in _subsets(count, _most_left_out(deviations, needed)):
+            cost = extra + float(cost_of_point[~is_kept].sum())
             if cost >= lowest + UNDECIDED:
                 continue
-            cost += _chi2(whitened[is_kept], target[is_kept])
-            if cost < lowest + UNDECIDED:
-                found.append(Explanation(is_kept, has_shape, cost))
-            lowest = min(lowest, cost)
+            chi2 = _chi2(whitened[is_kept], target[is_kept])
+            if cost + chi2 < lowest + UNDECIDED:
+                found.append(Explanation(is_kept, has_shape, cost + chi2, chi2))
+            lowest = min(lowest, cost + chi2)
     if not np.isfinite(lowest):
         return (_plain(deviations),)
     found = sorted((one for one in found if one.cost < lowest + UNDECIDED), key=lambda one: one.cost)
     return tuple(found[:1] if found[0].is_plain else found)
+
+
+def _most_left_out(deviations: Deviations, needed: int) -> int:
+    """How many may be left out of a fit of ``needed`` coefficients.
+
+    Of readings of one point that contradict each other all but one, whatever the other points are.
+    """
+    count, targets = len(deviations.points), len(set(deviations.points))
+    most = min((targets - needed) // REDUNDANCY, _MOST_LEFT_OUT if targets <= _MANY else 1)
+    most = max(most, 0) + min(count - targets, count - needed)
+    while most > 1 and comb(count, most) > _MOST_SELECTIONS:
+        most -= 1
+    return most
 
 
 def _plain(deviations: Deviations) -> Explanation:
@@ -332,8 +371,7 @@ def _contradicts(one: Explanation, price: Prices) -> bool:
     """Whether the points that an explanation keeps contradict each other nevertheless."""
     kept = int(np.count_nonzero(one.is_kept))
     dof = kept - (6 if one.has_shape else 3)
-    chi2 = one.cost - price.outlier * (len(one.is_kept) - kept) - price.shape * one.has_shape
-    return dof > 0 and np.isfinite(chi2) and bool(chdtrc(dof, max(chi2, 0.0)) < price.contradiction)
+    return dof > 0 and np.isfinite(one.chi2) and bool(chdtrc(dof, one.chi2) < price.contradiction)
 
 
 def rivals(explanations: Sequence[Explanation]) -> tuple[Explanation, ...]:
@@ -621,7 +659,7 @@ def _spread(
 
 
 def _deciding(deviations: Deviations, explanations: Sequence[Explanation]) -> PointId:
-    """The point at which the surfaces of the explanations differ most."""
+    """The point at which the surfaces of the explanations differ most; one that was not measured again, if possible."""
     surfaces = []
     for one in explanations:
         modes = quadratic if one.has_shape else rigid
@@ -629,7 +667,12 @@ def _deciding(deviations: Deviations, explanations: Sequence[Explanation]) -> Po
         fit = fit_modes(design, deviations.values_m[one.is_kept], deviations.sigmas_m[one.is_kept])
         if fit is not None:
             surfaces.append(modes(deviations.places_m) @ fit.values)
-    return deviations.points[int(np.argmax(np.ptp(np.array(surfaces), axis=0)))]
+    differences = np.ptp(np.array(surfaces), axis=0)
+    is_repeated = deviations.extra_readings > 0.0
+    is_repeated |= np.array([deviations.points.count(point) > 1 for point in deviations.points])
+    if not is_repeated.all():
+        differences[is_repeated] = 0.0
+    return deviations.points[int(np.argmax(differences))]
 
 
 def on_grid_m(mirror: Mirror, panel: PanelResult, cells: int) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -197,6 +197,52 @@ def test_repeated_readings_that_scatter_more_than_claimed_scale_the_sigmas(align
     assert any("standard deviations are multiplied by" in line for line in found["warnings"])
 
 
+def with_errors(errors_um: dict[int, float], seed: int = 4) -> list[str]:
+    """The lines of the first panel with its points off by so much along the normal, and of the others as they are."""
+    points = places(noise_um=2.0, seed=seed)
+    for number, error_um in errors_um.items():
+        points[number - 1] += 1e-3 * error_um * np.array(M1.rotate_world_from_deck(M1.panel(PANELS[0]).axes[2]))
+    return rows(points, labels())
+
+
+def test_a_point_that_is_measured_again_is_judged_by_the_other_points(aligned: Callable[..., Any]) -> None:
+    """A wrong reading, then the right one: only the wrong one is left out, and no standard deviation is larger."""
+    again = with_errors({}, seed=7)
+    for number in range(1, 10):
+        found = aligned([*with_errors({number: 50.0}), again[number - 1]], "--sigma-um", "2")
+        assert found["instrument"]["sigma_factor"] == 1.0
+        panel = found["panels"][0]
+        assert [one["is_outlier"] for one in panel["deviations"]].count(True) == 1
+        assert panel["deviations"][number - 1]["is_outlier"]
+        assert is_recovered(found)
+        (line,) = [line for line in found["warnings"] if "contradict each other" in line]
+        assert f"4/5/{number} by " in line
+        assert f"(lines {number}, 28; not used: {number})" in line
+        assert not any("again" in one for one in found["warnings"])
+
+
+def test_many_points_that_are_measured_again_do_not_change_the_sigmas(aligned: Callable[..., Any]) -> None:
+    again = with_errors({}, seed=7)
+    found = aligned([*with_errors({1: 50.0, 9: -70.0}), again[0], again[8]], "--sigma-um", "2")
+    assert found["instrument"]["sigma_factor"] == 1.0
+    assert len(found["instrument"]["contradictions"]) == 2
+    assert is_recovered(found)
+
+
+def test_what_the_program_asks_for_ends_the_question(aligned: Callable[..., Any]) -> None:
+    """Two equal errors, of which the points do not decide: the points that it asks for are measured again."""
+    again = with_errors({}, seed=7)
+    for pair in ((2, 3), (3, 6), (5, 6), (2, 8)):
+        lines = with_errors(dict.fromkeys(pair, 50.0))
+        asked = list[int]()
+        while (point := (found := aligned(lines, "--sigma-um", "2"))["panels"][0]["deciding_point"]) is not None:
+            assert point not in asked
+            asked.append(point)
+            lines.append(again[point - 1])
+        assert is_recovered(found)
+        assert len(asked) <= 4
+
+
 def test_copies_of_readings_count_once(aligned: Callable[..., Any]) -> None:
     once, thrice = (aligned(rows(places(), labels()) * times) for times in (1, 3))
     assert thrice["panels"] == once["panels"]
