@@ -31,6 +31,7 @@ from ccatp.mirror.surface import ConvergenceError
 ENOUGH = 3  # points of a plane
 _NAMED = 12  # largest number of unreliable points that are named
 _FEW = 3  # panels, of which most may have outliers
+_MOST_EXPLANATIONS = 4  # that a warning names
 _MOST_PASSES = 5  # of the fit of all panels with larger sigmas
 
 
@@ -219,7 +220,9 @@ def _remarks(result: PanelResult) -> list[str]:
     where = f"panel {result.panel.row}/{result.panel.col}"
     lines = []
     if result.alternatives:
-        *others, last = (_explained(result, one) for one in (result.explained, *result.alternatives))
+        every = [_explained(result, one) for one in (result.explained, *result.alternatives)]
+        left = len(every) - _MOST_EXPLANATIONS
+        *others, last = [*every[:_MOST_EXPLANATIONS], f"{left} others"] if left > 1 else every
         where_again = "/".join(map(str, result.deciding or ()))
         lines.append(
             f"{where}: its points do not decide between {', '.join(others)} and {last}; its moves are uncertain by the "

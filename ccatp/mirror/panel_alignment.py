@@ -318,35 +318,61 @@ class Explanation(NamedTuple):
 
 # Difference of the costs below which the points do not decide: one explanation is less than a thousand times as likely.
 UNDECIDED = 13.8
+# Cost of a further wrong point on a panel that has wrong points: the probability is one in a hundred.
+FURTHER_POINT = 9.2
 
 
 def explain(deviations: Deviations, price: Prices) -> tuple[Explanation, ...]:
-    """All explanations of a panel's deviations that the points do not exclude, the cheapest first.
+    """All explanations of a panel's deviations that the points do not exclude, the chosen one first.
 
     All points are kept if the panel cannot be fitted, or has too few redundant points. A plain panel has no others.
     A point that is the mean of more readings than others costs as many points: all of them would have to be wrong.
     """
+    found = _explanations(deviations, price)
+    if not found:
+        return (_plain(deviations),)
+    best, *others = found
+    if best.is_plain:
+        return (best,)
+    if not best.is_kept.all() and len(set(deviations.points)) <= _MANY:
+        # What is too many to be chosen may be true nevertheless: with bending, two wrong points look like one.
+        others = [one for one in others if one.extends(best)]
+        others += [one for one in _explanations(deviations, price, best) if not one.extends(best)]
+    return (best, *others)
+
+
+def _explanations(deviations: Deviations, price: Prices, best: Explanation | None = None) -> list[Explanation]:
+    """Explanations that are not much dearer than the cheapest one, or than the ``best``, by their cost.
+
+    With a ``best``: also those that leave out one point more than may be chosen, but for a bent panel if the best one
+    is rigid. What they leave out beyond its number is cheaper, since wrong points of a panel often have one cause.
+    """
     count = len(deviations.points)
-    cost_of_point = price.outlier * (1.0 + deviations.extra_readings)
     target = deviations.values_m / deviations.sigmas_m
-    found, lowest = list[Explanation](), np.inf
+    cost_of_point = price.outlier * (1.0 + deviations.extra_readings)
+    free = count if best is None else int(np.count_nonzero(~best.is_kept))
+    found, lowest = list[Explanation](), np.inf if best is None else best.cost
     for modes, needed in ((rigid, 3), (quadratic, 6)):
         has_shape = modes is quadratic
         extra = price.shape if has_shape else 0.0
         whitened = modes(deviations.places_m) * (deviations.lever / deviations.sigmas_m)[:, None]
         whitened /= np.linalg.norm(whitened, axis=0)
-        for is_kept in _subsets(count, _most_left_out(deviations, needed)):
-            cost = extra + float(cost_of_point[~is_kept].sum())
+        most = _most_left_out(deviations, needed)
+        if best is not None and has_shape <= best.has_shape:
+            most = min(most + 1, count - needed - 1)
+        for is_kept in _subsets(count, most):
+            further = max(int(np.count_nonzero(~is_kept)) - free, 0)
+            cost = extra + float(cost_of_point[~is_kept].sum()) - further * (price.outlier - FURTHER_POINT)
             if cost >= lowest + UNDECIDED:
                 continue
             chi2 = _chi2(whitened[is_kept], target[is_kept])
             if cost + chi2 < lowest + UNDECIDED:
                 found.append(Explanation(is_kept, has_shape, cost + chi2, chi2))
-            lowest = min(lowest, cost + chi2)
+            if best is None:
+                lowest = min(lowest, cost + chi2)
     if not np.isfinite(lowest):
-        return (_plain(deviations),)
-    found = sorted((one for one in found if one.cost < lowest + UNDECIDED), key=lambda one: one.cost)
-    return tuple(found[:1] if found[0].is_plain else found)
+        return []
+    return sorted((one for one in found if one.cost < lowest + UNDECIDED), key=lambda one: one.cost)
 
 
 def _most_left_out(deviations: Deviations, needed: int) -> int:
@@ -525,7 +551,7 @@ class PanelResult:
     ``shape``, and ``bending`` (moves that also remove twist and bowl), are None if there are too few points.
     ``sigma_factor``: by which the standard deviations are multiplied, as the points contradict each other.
     ``alternatives``: other explanations of the deviations that the points do not exclude; the covariances contain the
-    differences. ``deciding``: the point at which the explanations differ most; measured again, it decides between them.
+    differences. ``deciding``: the point that tells the chosen explanation from the others if it is measured again.
     """
 
     panel: PanelId
@@ -659,7 +685,10 @@ def _spread(
 
 
 def _deciding(deviations: Deviations, explanations: Sequence[Explanation]) -> PointId:
-    """The point at which the surfaces of the explanations differ most; one that was not measured again, if possible."""
+    """The point that tells the first of the explanations from all others; one that was not measured again, if possible.
+
+    At it the difference of the surface from the nearest of the others is largest.
+    """
     surfaces = []
     for one in explanations:
         modes = quadratic if one.has_shape else rigid
@@ -667,7 +696,7 @@ def _deciding(deviations: Deviations, explanations: Sequence[Explanation]) -> Po
         fit = fit_modes(design, deviations.values_m[one.is_kept], deviations.sigmas_m[one.is_kept])
         if fit is not None:
             surfaces.append(modes(deviations.places_m) @ fit.values)
-    differences = np.ptp(np.array(surfaces), axis=0)
+    differences = np.min(np.abs(np.array(surfaces[1:]) - surfaces[0]), axis=0)
     is_repeated = deviations.extra_readings > 0.0
     is_repeated |= np.array([deviations.points.count(point) > 1 for point in deviations.points])
     if not is_repeated.all():

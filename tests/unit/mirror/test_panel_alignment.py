@@ -251,6 +251,49 @@ def test_two_equal_outliers_that_a_bent_panel_explains_as_well_are_not_decided()
     assert 5 <= undecided <= 25
 
 
+@pytest.mark.parametrize(
+    ("first_m", "second_m", "most_wrong"), [(50e-6, 50e-6, 0), (50e-6, -50e-6, 1), (50e-6, 30e-6, 1)]
+)
+def test_two_wrong_points_of_a_bent_panel_that_look_like_another_one_are_not_decided(
+    first_m: float, second_m: float, most_wrong: int
+) -> None:
+    """The moves are uncertain by it. One pair of 36 looks like two wrong points of a rigid panel, which is likelier."""
+    rng = np.random.default_rng(32)
+    truth = fit_bent(on_grid(BENT), np.ones(9, dtype=np.bool_), rigid, half_size_m(M1.panel(TILTED)))
+    assert truth is not None
+    places = adjuster_places(M1, TILTED)[1]
+    pulls = []
+    for pair in combinations(range(9), 2):
+        values = BENT + noise(rng)
+        values[list(pair)] += [first_m, second_m]
+        panel = panel_result(M1, TILTED, on_grid(values), PRICE, 1.0)
+        assert panel is not None
+        pulls.append(np.max(np.abs(rigid(places) @ (panel.fit.values - truth.values)) / panel.rigid.moves.sigma_m))
+    # The largest of five moves of 36 panels.
+    assert sum(pull > 4.0 for pull in pulls) <= most_wrong
+
+
+def test_one_wrong_point_of_a_bent_panel_is_decided_by_further_readings() -> None:
+    """Two wrong points might look like it; the points that are asked for are measured again until it is decided."""
+    rng = np.random.default_rng(33)
+    for k in range(9):
+        values, points, asked = BENT + noise(rng), [*range(9)], list[int]()
+        values[k] += 50e-6
+        while True:
+            named = tuple(PointId(1, 1, at + 1) for at in points)
+            measured = on_grid(values, places_m=GRID_M[points])._replace(points=named)
+            panel = panel_result(M1, TILTED, measured, PRICE, 1.0)
+            assert panel is not None
+            if panel.deciding is None:
+                break
+            asked.append(panel.deciding.point - 1)
+            points.append(asked[-1])
+            values = np.append(values, BENT[asked[-1]] + rng.normal() * SIGMA_M)
+        assert np.flatnonzero(~panel.is_kept).tolist() == [k]
+        assert len(set(asked)) == len(asked)
+        assert 1 <= len(asked) <= 4
+
+
 def test_a_bent_panel_keeps_its_points() -> None:
     rng = np.random.default_rng(4)
     for _ in range(50):
