@@ -1,20 +1,18 @@
-"""The work at the adjusters: steps that make the moves of a survey, and whether a later survey shows them made."""
+"""The work at the adjusters: steps that make the moves of a survey; and how well two surveys repeat a point."""
 
 from collections.abc import Sequence
-from enum import StrEnum
 from math import ceil
 from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.config.models import AdjustersConfig
-from ccatp.core import FloatArray, PanelId
+from ccatp.core import PanelId
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.panel_alignment import Moves, PanelResult, adjuster_places
+from ccatp.mirror.panel_alignment import PanelResult, adjuster_places
 
 _MEANING = 3.0  # standard deviations of a move from which it is worth a turn
 _NAMED = 12  # largest number of panels that a message names
-_SIGMAS = 4.0  # of a difference that noise does not make in the several hundred adjusters of a mirror
 
 
 class Step(NamedTuple):
@@ -98,73 +96,6 @@ def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult
 def _names(panels: Sequence[PanelId]) -> str:
     names = [f"{panel.row}/{panel.col}" for panel in panels]
     return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
-
-
-class Made(StrEnum):
-    """Whether a move was made."""
-
-    AS_PLANNED = "as planned"
-    NOT = "did not move"
-    WRONG_WAY = "moved the wrong way"
-    PARTLY = "moved too little"
-    TOO_FAR = "moved too far"
-
-
-class MoveCheck(NamedTuple):
-    """One adjuster: planned and measured move, m, the sigma of their difference, and the verdict."""
-
-    panel: PanelId
-    adjuster: str
-    planned_m: float
-    measured_m: float
-    sigma_m: float
-    made: Made
-
-
-def made_of(planned_m: float, measured_m: float, sigma_m: float) -> Made:
-    """The verdict on one move; as planned is a measured move that differs from it by no more than noise."""
-    limit = _SIGMAS * sigma_m
-    if abs(measured_m - planned_m) <= limit:
-        return Made.AS_PLANNED
-    if abs(measured_m) <= limit:
-        return Made.NOT
-    if measured_m * planned_m < 0.0 and abs(planned_m) > limit:
-        return Made.WRONG_WAY
-    if abs(measured_m) < abs(planned_m):
-        return Made.PARTLY
-    return Made.TOO_FAR
-
-
-def check_moves(
-    before: Sequence[PanelResult], after: Sequence[PanelResult], errors: tuple[slice, slice]
-) -> tuple[MoveCheck, ...]:
-    """Moves planned by the survey ``before``, and the change of the panels at their adjusters that ``after`` shows.
-
-    Nine points determine the moves of five adjusters: the change contains twist and bowl. ``errors``: those of the
-    errors common to the panels of a survey that differ between the surveys.
-    """
-    found = []
-    for one, other in zip(before, after, strict=True):
-        if one.bending is None or other.bending is None:
-            continue
-        measured = one.bending.moves.values_m - other.bending.moves.values_m
-        plans = one.bending.moves, other.bending.moves
-        variances = sum(_own_variances(plan, part) for plan, part in zip(plans, errors, strict=True))
-        for name, planned, moved, sigma in zip(
-            one.adjusters,
-            one.rigid.moves.values_m.tolist(),
-            measured.tolist(),
-            np.sqrt(variances).tolist(),
-            strict=True,
-        ):
-            found.append(MoveCheck(one.panel, name, planned, moved, sigma, made_of(planned, moved, sigma)))
-    return tuple(found)
-
-
-def _own_variances(moves: Moves, errors: slice) -> FloatArray:
-    """Variances of moves without the errors that cancel between two surveys."""
-    cancel = np.delete(moves.common_m, np.arange(moves.common_m.shape[1])[errors], axis=1)
-    return np.asarray(np.diag(moves.covariance_m2) - np.sum(cancel**2, axis=1))
 
 
 def repeatability_m(before: Sequence[PanelResult], after: Sequence[PanelResult]) -> float | None:

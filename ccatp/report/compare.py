@@ -11,8 +11,9 @@ from scipy.special import chdtrc, chdtri
 
 from ccatp.config.files import write_file
 from ccatp.core import FloatArray, PanelId
-from ccatp.mirror.adjuster_work import Made, check_moves, repeatability_m
+from ccatp.mirror.adjuster_work import repeatability_m
 from ccatp.mirror.mirror_alignment import joint_covariance
+from ccatp.mirror.move_checks import Made, MoveExplanation, PanelCheck, check_moves
 from ccatp.mirror.network_model import Effect
 from ccatp.mirror.network_points import CalibratedSurveys
 from ccatp.mirror.panel_alignment import PanelResult, mirror_wavefront
@@ -100,7 +101,7 @@ class RunPair:
     """Two runs, called A and B as on the page, and the changes between them.
 
     ``panels``: the fitted panels of each run; ``wavefronts``: half-wavefront errors of the panels that both runs have,
-    or None. ``checks``: the moves that A plans against the change that B shows, if any panel has moved;
+    or None. ``checks``: by panel, the moves that A plans against the change that B shows, if any panel has moved;
     ``repeatability_m``: of a point, by both surveys.
 
     Points and panels are compared only if the mirror is the same; otherwise ``warning`` is not empty.
@@ -121,8 +122,9 @@ class RunPair:
         )
         both = [[self.panels[k][panel] for panel in common] for k in (0, 1)]
         has_moved = self.changes is not None and any(panel.has_moved for panel in self.changes.panels)
-        self.checks = check_moves(both[0], both[1], differing_errors(a.network, b.network)) if has_moved else ()
-        self.verdicts = Counter(one.made for one in self.checks)
+        mirror, errors = b.record.mirror, differing_errors(a.network, b.network)
+        self.checks = check_moves(mirror, both[0], both[1], errors) if has_moved else ()
+        self.verdicts = Counter(move.made for one in self.checks for move in one.moves)
         self.repeatability_m = repeatability_m(both[0], both[1])
         self.wavefronts = [
             mirror_wavefront([panel.rigid.wavefront for panel in panels.values() if panel.panel in common])
@@ -227,9 +229,9 @@ def compare_page(pair: RunPair) -> str:
     return render(
         "compare.html",
         pair=pair,
-        as_planned=Made.AS_PLANNED,
         figures=page_figures(compare_drawings(pair)),
         compared=compared_figures(pair),
+        wrong=wrong_moves(pair.checks),
         changed=changed_keys(ours, others),
         points=[(earlier[verdict.point], verdict) for verdict in pair.b.points if verdict.point in earlier],
         surfaces=surfaces,
@@ -267,8 +269,58 @@ def compare_lines(pair: RunPair) -> list[str]:
     names = [one.name.replace("\u00b5", "u").replace("\u03c3", "sigma") for one in rows]
     width = max(map(len, names), default=0) + 2
     return render(
-        "compare.txt", pair=pair, as_planned=Made.AS_PLANNED, rows=[*zip(names, rows, strict=True)], width=width
+        "compare.txt", pair=pair, wrong=wrong_moves(pair.checks), rows=[*zip(names, rows, strict=True)], width=width
     ).splitlines()
+
+
+class WrongMove(NamedTuple):
+    """A line of what is not as planned: an adjuster with its moves, or a panel whose plane has several explanations."""
+
+    panel: PanelId
+    what: str
+    text: str
+
+
+def wrong_moves(checks: Sequence[PanelCheck]) -> list[WrongMove]:
+    """What is not as planned, panel by panel."""
+    found = []
+    for check in checks:
+        if check.is_as_planned:
+            continue
+        if check.is_plane:
+            found.append(WrongMove(check.panel, "not as planned", _plane_text(check)))
+            continue
+        found += [
+            WrongMove(
+                check.panel,
+                f"{one.adjuster} {one.made.value}",
+                f"planned {MICRO * one.planned_m:+.1f} um, measured {MICRO * one.measured_m:+.1f} "
+                f"+- {MICRO * one.sigma_m:.1f} um",
+            )
+            for one in check.moves
+            if one.made is not Made.AS_PLANNED
+        ]
+    return found
+
+
+def _plane_text(check: PanelCheck) -> str:
+    if not check.explanations:
+        return "two or more adjusters; the panel has not bent, and its plane alone does not tell which"
+    planned = {one.adjuster: one.planned_m for one in check.moves}
+    text = ", or ".join(_explanation_text(one, planned) for one in check.explanations)
+    return f"{text}; its plane alone does not tell which" if len(check.explanations) > 1 else text
+
+
+def _explanation_text(one: MoveExplanation, planned_m: Mapping[str, float]) -> str:
+    if one.made is Made.EXCHANGED:
+        return f"{' and '.join(one.adjusters)} were exchanged"
+    if one.factor is not None:
+        whole = {Made.NOT: "no adjuster moved", Made.WRONG_WAY: "all adjusters moved the wrong way"}
+        return whole.get(one.made, f"all adjusters moved by {one.factor:.2f} times the plan")
+    return " and ".join(
+        f"{name} moved by {MICRO * moved:+.1f} +- {MICRO * sigma:.1f} um in place of {MICRO * planned_m[name]:+.1f} um"
+        for name, moved, sigma in zip(one.adjusters, one.moved_m, one.sigmas_m, strict=True)
+    )
 
 
 def compare_data(pair: RunPair) -> dict[str, Any]:
@@ -292,7 +344,11 @@ def compare_data(pair: RunPair) -> dict[str, Any]:
                 "sigma_um": round(MICRO * one.sigma_m, 4),
                 "made": one.made.value,
             }
-            for one in pair.checks
+            for check in pair.checks
+            for one in check.moves
+        ],
+        "explanations": [
+            {**one.panel._asdict(), "what": one.what, "text": one.text} for one in wrong_moves(pair.checks)
         ],
         "repeatability_um": pair.repeatability_m and round(MICRO * pair.repeatability_m, 4),
     }

@@ -8,11 +8,12 @@ import pytest
 
 from ccatp.config.models import AdjustersConfig
 from ccatp.core import DeckPose, Fix, Measured, PanelId
-from ccatp.mirror.adjuster_work import Made, check_moves, made_of, repeatability_m, work_list
+from ccatp.mirror.adjuster_work import repeatability_m, work_list
 from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.mirror_alignment import survey_result
 from ccatp.mirror.misalignment import PanelMisalignment
-from ccatp.mirror.panel_alignment import PanelResult, adjustable, adjuster_places
+from ccatp.mirror.move_checks import Made, check_moves, made_of
+from ccatp.mirror.panel_alignment import PanelResult, adjustable, adjuster_places, rigid
 from tests.support.scenario import world_of
 
 HEIGHT_M = 0.05
@@ -140,8 +141,51 @@ def test_a_move_is_judged_by_its_sigma(planned: float, measured: float, made: Ma
 def test_the_next_survey_shows_which_adjuster_was_not_moved_as_planned(
     turned: dict[str, float], wrong: dict[str, Made]
 ) -> None:
-    found = check_moves([BEFORE], [after(turned)], ALL)
-    assert {one.adjuster: one.made for one in found if one.made is not Made.AS_PLANNED} == wrong
+    (found,) = check_moves(M1, [BEFORE], [after(turned)], ALL)
+    assert {one.adjuster: one.made for one in found.moves if one.made is not Made.AS_PLANNED} == wrong
+
+
+def rigid_after(moved_m: np.ndarray, seed: int = 2) -> PanelResult:
+    """A panel that does not bend after its adjusters were moved: its plane follows them by least squares."""
+    plane = np.linalg.lstsq(rigid(adjuster_places(M1, PANEL)[1]), moved_m, rcond=None)[0]
+    return surveyed(START + np.array([*plane, 0.0, 0.0]), seed)
+
+
+PLANNED_M = BEFORE.rigid.moves.values_m
+
+
+@pytest.mark.parametrize(
+    ("moved_m", "explanations", "made"),
+    [
+        (PLANNED_M, set(), {}),
+        (0.0 * PLANNED_M, {(Made.NOT, "V1 V2 V3 V4 V5")}, dict.fromkeys(BEFORE.adjusters, Made.NOT)),
+        (-PLANNED_M, {(Made.WRONG_WAY, "V1 V2 V3 V4 V5")}, dict.fromkeys(BEFORE.adjusters, Made.WRONG_WAY)),
+        (2.0 * PLANNED_M, {(Made.OPEN, "V1 V2 V3 V4 V5")}, dict.fromkeys(BEFORE.adjusters, Made.TOO_FAR)),
+        (PLANNED_M * [1, 1, 1, 0, 1], {(Made.OPEN, "V4")}, {"V4": Made.NOT}),
+        (PLANNED_M[[3, 1, 2, 0, 4]], {(Made.EXCHANGED, "V1 V4")}, {"V1": Made.EXCHANGED, "V4": Made.EXCHANGED}),
+        # The same plane: it does not tell which of the two pairs.
+        (
+            PLANNED_M[[1, 0, 2, 3, 4]],
+            {(Made.EXCHANGED, "V1 V2"), (Made.EXCHANGED, "V3 V4")},
+            dict.fromkeys(("V1", "V2", "V3", "V4"), Made.OPEN),
+        ),
+    ],
+)
+def test_a_plane_names_the_fewest_adjusters_that_explain_it(
+    moved_m: np.ndarray, explanations: set[tuple[Made, str]], made: dict[str, Made]
+) -> None:
+    (found,) = check_moves(M1, [BEFORE], [rigid_after(moved_m)], ALL)
+    assert found.is_plane
+    assert {(one.made, " ".join(one.adjusters)) for one in found.explanations} == explanations
+    assert {one.adjuster: one.made for one in found.moves if one.made is not Made.AS_PLANNED} == made
+
+
+def test_a_plane_that_many_adjusters_explain_names_none() -> None:
+    (found,) = check_moves(
+        M1, [BEFORE], [rigid_after(PLANNED_M + 1e-6 * np.array([60.0, -35.0, 95.0, 0.0, -80.0]))], ALL
+    )
+    assert (found.is_plane, found.explanations, found.is_as_planned) == (True, (), False)
+    assert {one.made for one in found.moves} == {Made.OPEN}
 
 
 def test_the_repeatability_of_a_point_is_its_noise() -> None:
