@@ -110,7 +110,7 @@ def _check(mirror: Mirror, one: PanelResult, other: PanelResult, errors: tuple[s
             made = [made_of(*each) for each in zip(planned, bent, np.sqrt(np.diag(covariance)), strict=True)]
             return PanelCheck(one.panel, _moves(one, bent, covariance, made), False, ())
     change, covariance = _change((one.rigid.moves, other.rigid.moves), errors)
-    to_plane: FloatArray = np.linalg.pinv(modes)
+    to_plane = np.asarray(np.linalg.pinv(modes), dtype=np.float64)
     of_plane = to_plane @ covariance @ to_plane.T
     sigmas = np.sqrt(np.diag(covariance))
     if _probability(to_plane @ (change - planned), of_plane) >= _FALSE_ALARM:
