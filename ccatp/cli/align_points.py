@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import chdtr
 
 from ccatp.config.files import read_input
 from ccatp.config.load import load_config
@@ -33,6 +34,7 @@ from ccatp.mirror.mirror_alignment import SurveyResult, survey_result
 from ccatp.mirror.point_file import Reading, is_of_coordinate, parse_points
 from ccatp.records.run_reader import CONFIG, check_run_dir
 
+_CAUTIOUS = 2.0
 _MOST_BYTES = 1 << 24  # a hundred readings of each of 783 points are 5 MB
 _NAMED = 12  # largest number of panels, and of points, that a line names
 
@@ -97,6 +99,14 @@ class AlignedPoints(NamedTuple):
                 )
         if self.assigned.contradictions:
             lines.append(self._contradictions)
+        chi2 = sum(panel.fit.chi2 for panel in self.result.panels)
+        dof = sum(panel.fit.dof for panel in self.result.panels)
+        # Sigmas that are twice too large are a cautious statement; beyond that they have another unit or meaning.
+        if dof > 0 and chi2 < dof / _CAUTIOUS**2 and float(chdtr(dof, chi2)) < self.cfg.align.false_alarm:
+            lines.append(
+                f"the points scatter about the panels by {np.sqrt(chi2 / dof):.2g} times their standard deviations: "
+                "these seem to be too large; check their unit, and of how many sigmas they are"
+            )
         if self.assigned.copies:
             lines.append(f"{self.assigned.copies} readings are copies of others to the last digit, and count once")
         if self.assigned.by_position:

@@ -18,8 +18,8 @@ _NAMED = 12  # largest number of panels that a message names
 class Step(NamedTuple):
     """One turn of one adjuster: its place in the panel frame, m; move, m; ``turns`` of the screw if known.
 
-    ``round``: all adjusters of a panel are turned once in a round, so that none is ahead of the others by more than
-    the configured step. ``is_significant``: the whole move is more than three of its standard deviations.
+    ``round``: all adjusters of a panel are turned once in a round, none by more than the configured step.
+    ``is_significant``: the whole move is more than three of its standard deviations.
     """
 
     panel: PanelId

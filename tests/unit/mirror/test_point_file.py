@@ -274,6 +274,16 @@ def test_points_without_names_say_that_a_mirrored_axis_would_not_show(
     assert "27 readings are assigned to panels by position" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("sigma_um", "is_said"), [("15", False), ("25", False), ("900", True)])
+def test_sigmas_that_are_much_too_large_are_said(
+    sigma_um: str, is_said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "points.csv"
+    file.write_text(renamed(NAMES), encoding="utf-8")
+    assert main(["align", "--points", str(file), "--mirror", "fyst-m1", *OFFSET, "--sigma-um", sigma_um]) == 0
+    assert ("these seem to be too large" in capsys.readouterr().err) == is_said
+
+
 def test_an_outlier_has_the_name_of_its_target(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wrong = POINTS + np.where(np.arange(27) == 13, 0.4, 0.0)[:, None]
     for names in (NAMES, [f"T{k}" for k in range(27)]):
