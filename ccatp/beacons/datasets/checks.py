@@ -6,11 +6,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.beacons.datasets.consistency import inconsistencies
-from ccatp.beacons.datasets.mounting import misplaced_radios
+from ccatp.beacons.datasets.mounting import misplaced_radios, robust_fit
 from ccatp.beacons.datasets.tables import GAP_S, instant, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor, way_at
 from ccatp.beacons.estimation.evaluation import truth_at
 from ccatp.beacons.estimation.recording import Readings, RecordedRun, ReferencePath, Steps
+from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
 from ccatp.core import FloatArray
 
 MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
@@ -21,6 +22,7 @@ STRANGER_RATIO = 5.0  # also relative to the usual miss of the beacons
 FITTING = 0.3  # readings fit another position if they miss it by less than this share of the miss of their own
 EXCHANGED = 0.75  # two beacons are exchanged if the readings of each fit the other position by this share,
 EXCHANGE_FACTOR = 1.5  # and miss their own position by this many times the usual miss
+LEAST_FRAME = 3  # beacons that tell a frame
 AGREEMENT = 0.5  # length of the mean vector of bearing errors above which they have a common constant
 CLOSE = 0.9  # the same, above which bearings are good enough to compute positions
 PIECES = 4  # of the run, checked separately
@@ -43,10 +45,41 @@ def readings_against(run: RecordedRun, truth: ReferencePath) -> Iterator[str]:
         pose[:, 2] = np.nan
         seen = seen._replace(arm_m=None)  # without a heading the radios are about where the vehicle is
     pose[:, :2] = seen.radios_at(pose)
+    if frame := _other_frame(seen, pose, placed):
+        yield frame
+        return
     lines, off_rad = _bearings(seen, pose, placed)
     strange = yield from _misplaced(run.beacon_ids, placed, seen, pose, off_rad)
     yield from _ranges(seen, pose, placed, strange)
     yield from lines
+
+
+def _other_frame(seen: Readings, pose: FloatArray, placed: FloatArray) -> str:
+    """A warning if the survey fits the places that ranges from the true path give only after a rigid motion.
+
+    r^2 = |p|^2 - 2 p b + |b|^2 is linear in the place b and |b|^2.
+    """
+    found, given = [], []
+    for k in np.unique(seen.beacon).tolist():
+        rows = (seen.beacon == k) & (seen.range_m > 0.0)
+        if rows.sum() < FEW:
+            continue
+        middle = pose[rows, :2].mean(axis=0)
+        p, r = pose[rows, :2] - middle, seen.range_m[rows]
+        terms, *_ = robust_fit(np.column_stack([-p, 0.5 + 0.0 * r]) / r[:, None], 0.5 * (r**2 - (p**2).sum(axis=1)) / r)
+        found.append(middle + terms[:2])
+        given.append(placed[k])
+    if len(found) < LEAST_FRAME:
+        return ""
+    miss_m = float(np.sqrt(np.mean(np.sum((np.array(found) - given) ** 2, axis=1))))
+    fit_m = aligned_rms_m(np.array(found), np.array(given))
+    if miss_m < max(STRANGER_RATIO * fit_m, 2.0 * STRANGER_M):
+        return ""
+    motion = best_motion(np.array(given), np.array(found))
+    return (
+        f"the survey is in another frame than the truth: its beacons are {miss_m:.2g} m from where ranges on the true "
+        f"path have them, and {fit_m:.2g} m if the survey is turned by {motion.angle_rad:.3g} rad and moved"
+    )
 
 
 def _unit_slip(scale: float, units: tuple[tuple[str, float], ...] = LENGTHS) -> str:
@@ -180,6 +213,8 @@ TURN_WARNING = 0.05
 STANDS = 0.01  # share of the other's motion, below which odometry or truth does not move
 STANDS_M = 0.2
 LIKE = 0.3
+SPOT_M = 0.05  # radius of a turn on the spot,
+FEW_SPOTS = 0.2  # and their share of all turning, up to which positions tell how much the vehicle turns
 LEAST_TURNING_RAD2 = 0.1
 FASTEST_TURN_RAD_S = 10.0  # a faster turn means a wrong unit
 FASTEST_M_S = 50.0
@@ -316,7 +351,9 @@ def _copied_odometry(truth: ReferencePath, steps: Steps) -> Iterator[str]:
 def _turning_against(truth: ReferencePath, steps: Steps, rows: npt.NDArray[np.int64]) -> Iterator[str]:
     """Warnings about turns of the odometry, from the heading of the truth, or else from the shape of its path."""
     if not np.isfinite(truth.heading_rad).all():
-        factor = turning_factor(truth, steps)
+        size = np.abs(steps.turn_rad)
+        on_the_spot = np.hypot(steps.distance_m, steps.lateral_m) < SPOT_M * size  # leaves no shape in positions
+        factor = turning_factor(truth, steps) if size[on_the_spot].sum() < FEW_SPOTS * size.sum() else None
         if factor is not None:
             yield from _turns(factor, 1.0)
         return

@@ -200,7 +200,7 @@ def sudden_disagreement(track: EstimatedPath) -> list[str]:
     groups = list(_together(track))
     several = [one for one in groups if one.beacons > 1 and one.readings >= LEAST_TOGETHER]
     worst = max(several, key=lambda one: one.better_half, default=None)
-    asks = "was the vehicle moved, or a clock set?"
+    asks = "was the vehicle moved, or a clock set, or are these reflections?"
     if worst is not None and worst.better_half >= SUDDEN:
         return [
             f"readings of several beacons at once are off, at {instant(worst.begin_s)} by {worst.better_half:.3g} "

@@ -39,9 +39,11 @@ def misplaced_radios(
             continue
         ahead_m, left_m = run.antenna_m + arm_m if radio is None else np.array(radio[1:]) + arm_m
         name, given = ("the radio", run.antenna_m) if radio is None else (f"tag {radio.name}", radio[1:])
+        ahead = f"{abs(ahead_m):.2g} m {'ahead' if ahead_m >= 0.0 else 'behind'}"
+        left = f"{abs(left_m):.2g} m to the {'left' if left_m >= 0.0 else 'right'}"
         yield (
-            f"ranges fit {what} better if {name} is about {ahead_m:.2g} m ahead and {left_m:.2g} m to the left of the "
-            f"vehicle's origin, not {given[0]:.3g} and {given[1]:.3g} m: is its place given rightly?"
+            f"ranges fit {what} better if {name} is about {ahead} and {left} of the vehicle's origin, not at "
+            f"{given[0]:.3g} and {given[1]:.3g} m (ahead, left): is its place given rightly?"
         )
 
 

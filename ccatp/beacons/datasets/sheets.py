@@ -315,7 +315,7 @@ def _check_range(path: Path, line: int, reading: MoteRange) -> None:
         raise RadioDataError(path, problem, line)
 
 
-_HEAD = "# Beacons, mapped by ccatp radio map: m, and the covariance of all coordinates in their order, m^2.\n\n"
+_HEAD = "# Beacons, mapped by ccatp: m, and the covariance of all coordinates in their order, m^2.\n\n"
 
 
 def write_beacons(

@@ -174,7 +174,7 @@ class Table(NamedTuple):
         """Rows that are finite in the first ``columns`` (default: all); the others are dropped with a warning."""
         finite = np.asarray(np.isfinite(self.values[:, :columns]).all(axis=1))
         if not finite.all():
-            warnings.append(self.note(~finite, "not finite (the first here), not used"))
+            warnings.append(self.note(~finite, "not finite or empty (the first here), not used"))
         return self.where(finite)
 
     def with_unknown_ways(self, warnings: list[str]) -> "Table":
@@ -182,7 +182,7 @@ class Table(NamedTuple):
         unknown = np.isfinite(self.values[:, 0]) & ~np.isfinite(self.values).all(axis=1)
         if not unknown.any():
             return self
-        warnings.append(self.note(unknown, "not finite (the first here): the way there is not measured"))
+        warnings.append(self.note(unknown, "not finite or empty (the first here): the way there is not measured"))
         values = self.values.copy()
         values[unknown, 1:] = np.nan
         return self._replace(values=values)
@@ -261,7 +261,9 @@ def within(times_s: FloatArray, odometry_s: FloatArray, what: str, warnings: lis
     """Mask of the times within the span of the odometry; warns of the others."""
     inside = (times_s >= odometry_s[0]) & (times_s <= odometry_s[-1])
     if not inside.all():
-        warnings.append(f"{plural(int((~inside).sum()), what)} before the first or after the last odometry, not used")
+        warnings.append(
+            f"{plural(int((~inside).sum()), what)} before the first or after the last odometry in use, not used"
+        )
     return np.asarray(inside)
 
 

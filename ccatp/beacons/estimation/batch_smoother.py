@@ -273,7 +273,10 @@ def _calibration(
 
 def _warnings(run: RecordedRun, start: Start, converged: bool) -> Iterator[str]:
     for k, name in enumerate(run.beacon_ids):
-        if not start.used[k]:
+        seen = run.readings.where(run.readings.beacon == k)
+        if not start.used[k] and np.isnan(seen.range_m).all() and np.isnan(seen.rssi_dbm).all():
+            yield f"beacon {name} could not be placed: bearings alone do not place a beacon, a range or level is needed"
+        elif not start.used[k]:
             yield f"beacon {name} could not be placed: too few readings of it, or all from one place"
         elif start.doubtful[k]:
             yield f"beacon {name} may lie at its mirror image: the path determines its side too little"

@@ -301,7 +301,7 @@ def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) 
         why = "pushed, beacons misread, or odometry that misses something?"
         yield f"the pose was uncertain {slam.jumps} times: {why}"
     if refused > DOUBTFUL_SHARE * readings:
-        yield f"{refused} of {readings} readings were refused: do they belong to this odometry?"
+        yield f"{refused} of {readings} readings were refused: are they of this odometry, or reflections?"
 
 
 def _unplaced(run: RecordedRun, slam: BeaconSlam) -> Iterator[str]:

@@ -282,6 +282,15 @@ def test_headings_that_contradict_the_course_are_not_used(tmp_path: Path) -> Non
     assert run.first_pose == pytest.approx(w.poses[0], abs=0.1)
 
 
+def test_a_survey_in_another_frame_than_the_truth_is_named(tmp_path: Path) -> None:
+    lines = [line for line in csv_lines(world()) if not line.startswith("beacon")]
+    lines += [f"beacon,{name},{10.0 - y},{x - 7.0}" for name, (x, y) in BEACONS.items()]
+    said = read_run(write_lines(tmp_path / "run.csv", lines), None, None).warnings
+    assert any("the survey is in another frame than the truth" in line for line in said)
+    assert any("turned by -1.57 rad" in line for line in said)
+    assert not any("ranges read" in line or "miss its surveyed place" in line for line in said)
+
+
 def test_headings_are_not_taken_as_clockwise_if_the_odometry_turns_the_other_way(tmp_path: Path) -> None:
     w = world()
     mirrored = [

@@ -142,7 +142,7 @@ def test_wrong_places_of_radios_are_named_and_right_ones_are_not() -> None:
 
     assert said(TAGS) == ""
     (front, rear) = TAGS
-    assert "tag rear is about -0.3 m ahead and -0.2 m to the left" in said((front, rear._replace(ahead_m=0.0)))
+    assert "tag rear is about 0.3 m behind and 0.2 m to the right" in said((front, rear._replace(ahead_m=0.0)))
     assert said((front, rear._replace(ahead_m=0.0))).count("tag ") == 1
     exchanged = said((front._replace(ahead_m=-0.3, left_m=-0.2), rear._replace(ahead_m=0.4, left_m=0.1)))
     assert "tag front" in exchanged
