@@ -16,6 +16,7 @@ from ccatp.beacons.estimation.recording import (
     RecordedRun,
     Steps,
     antenna_path,
+    first_of_each,
     running_total,
 )
 from ccatp.core import FloatArray, IntArray
@@ -48,8 +49,7 @@ class Reckoning:
         self._delayed = delayed
         inside = (steps.times_s > times_s[0]) & (steps.times_s < times_s[-1])
         inner_s = steps.times_s[inside]
-        _, first = np.unique(np.floor(inner_s / FINEST_S), return_index=True)
-        fine_s = np.union1d(inner_s[first], times_s)
+        fine_s = np.union1d(inner_s[first_of_each(inner_s, FINEST_S)], times_s)
         self._starts = np.searchsorted(fine_s, times_s)[:-1]
         self._lengths = np.diff(np.append(self._starts, fine_s.size - 1))
         lasts_s = np.diff(steps.times_s)

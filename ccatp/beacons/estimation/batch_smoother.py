@@ -34,7 +34,15 @@ from ccatp.beacons.estimation.landmark_init import LEAST
 from ccatp.beacons.estimation.least_squares import WELL_CONVERGED, Factored, descend, t_weights
 from ccatp.beacons.estimation.measurement_models import HEIGHT_M2
 from ccatp.beacons.estimation.odometry_noise import OdometryNoise, odometry_noise
-from ccatp.beacons.estimation.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun, Steps
+from ccatp.beacons.estimation.recording import (
+    BeaconFix,
+    BoolArray,
+    Calibrated,
+    EstimatedPath,
+    RecordedRun,
+    Steps,
+    first_of_each,
+)
 from ccatp.beacons.estimation.window import spread_by_priors
 from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.beacons.rigid_motion import best_motion
@@ -151,9 +159,8 @@ def smooth(
     """
     begin_s = clock_s()
     steps_s = run.steps.times_s  # poses are at all readings, and every SPACING_S at a step of the odometry
-    _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
     readings = run.readings.with_distances(settings.radio.camera_field_rad)
-    times_s = np.union1d(readings.times_s, steps_s[first])
+    times_s = np.union1d(readings.times_s, steps_s[first_of_each(steps_s, SPACING_S)])
     found = found or follow(run, settings, how, lambda: 0.0, SPACING_S)
     start, rest = _started(run, found.settings, found, times_s), (how.rest_speed_m_s, how.rest_turn_rad_s)
     removed = {str(name) for name, _ in found.slam.moved}

@@ -188,11 +188,10 @@ class BeaconSlam:
         return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._names)}
 
     @property
-    def heights(self) -> dict[str, tuple[float, float]]:
-        """The same of the square of the height of each beacon on the map, if it is estimated."""
-        found = {b: self.place(b).stop - 1 for b in self._map if b in self._raised}
-        mean, P = self.engine.mean, self.engine.covariance
-        return {f"{HEIGHT_M2} {b}": (float(mean[at]), sqrt(P[at, at])) for b, at in found.items()}
+    def calibration_states(self) -> dict[str, int]:
+        """State of each estimated calibration parameter by name, also of the square of the height of each beacon."""
+        heights = {f"{HEIGHT_M2} {b}": self.place(b).stop - 1 for b in self._map if b in self._raised}
+        return {name: POSE + i for i, name in enumerate(self._names)} | heights
 
     def predict(self, odometry: Odometry) -> None:
         """Predict the vehicle over the odometry that is due."""

@@ -26,6 +26,7 @@ from ccatp.beacons.estimation.recording import (
     ReadingInnovation,
     RecordedRun,
     Steps,
+    first_of_each,
 )
 from ccatp.beacons.estimation.window import Window, excesses
 from ccatp.beacons.filters.ekf_slam import columns_of
@@ -243,16 +244,14 @@ def _result(
     used = [one for one in log.learned if one.accepted]
     refused = len(log.learned) - len(used)
     nis, sizes = np.array([(one.nis, float(one.size)) for one in used]).reshape(-1, 2).T
-    # Only values that the readings have determined at least in part.
-    calibration = {
-        name: Calibrated(*found)
-        for name, found in slam.calibration.items()
-        if found[1] < UNCHANGED * getattr(assumed, name)
-    } | {
-        name: Calibrated(*found)
-        for name, found in slam.heights.items()
-        if found[1] < UNCHANGED * assumed.beacon_height_m2
-    }
+    states, priors = slam.calibration_states, assumed.model_dump()
+    at = columns_of(tuple(states.values()))
+    own, spread = slam.engine.covariance[at, at].tolist(), slam.error_covariance(at, excess).diagonal().tolist()
+    calibration = {}
+    for k, (key, state) in enumerate(states.items()):
+        prior = priors.get(key, assumed.beacon_height_m2)
+        if own[k] < (UNCHANGED * prior) ** 2:  # only values that the readings have determined at least in part
+            calibration[key] = Calibrated(float(slam.engine.mean[state]), sqrt(spread[k]))
     beacons, none = [(name, fix) for name, fix in slam.beacons.items() if name not in slam.walks_m2_s], np.empty(0)
     for name, until_s, fix in slam.left:
         log.tracks.setdefault(str(name), []).append((until_s, fix.mean[:2], fix.covariance[:2, :2]))
@@ -324,8 +323,7 @@ def _kinds(run: RecordedRun) -> dict[BeaconId, str]:
 
 
 def _spaced(times_s: FloatArray, finest_s: float) -> FloatArray:
-    _, first = np.unique(np.floor((times_s - times_s[0]) / finest_s), return_index=True)
-    return np.union1d(times_s[first], times_s[-1:])
+    return np.union1d(times_s[first_of_each(times_s, finest_s)], times_s[-1:])
 
 
 def _increments(steps: Steps, times_s: FloatArray) -> list[Increment]:

@@ -39,7 +39,8 @@ class TrackEvaluation(NamedTuple):
     beacon_errors_m: Mapping[str, float]
     nees: Consistency | None
     nis: Consistency | None
-    errors_m: FloatArray  # of each aligned position, shape (n,); NaN where there is no truth
+    times_s: FloatArray  # of the poses that are compared, shape (n,)
+    errors_m: FloatArray  # of each of these aligned positions, shape (n,); NaN where there is no truth
 
 
 def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
@@ -48,6 +49,7 @@ def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
     One rigid motion without scale aligns the positions with the truth, and is applied to the beacons. If only the
     beacons were surveyed, they are aligned themselves. On a known map nothing is aligned.
     """
+    track = comparable(track, run.truth)
     truth = np.full((len(track.times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, track.times_s)
     known = np.isfinite(truth[:, 0])
     if known.sum() < LEAST_KNOWN:
@@ -79,8 +81,22 @@ def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
         beacon_errors_m=dict(zip(common, offsets.tolist(), strict=True)) if measurable else {},
         nees=_nees(track, truth, known) if is_one_frame else None,
         nis=consistency(track.nis, track.nis_sizes),
+        times_s=track.times_s,
         errors_m=errors,
     )
+
+
+def comparable(track: EstimatedPath, truth: ReferencePath | None) -> EstimatedPath:
+    """The track at the times of a sparse truth, between whose rows the vehicle turns; else the track itself.
+
+    Covariances are those of the nearest pose.
+    """
+    if truth is None or float(np.median(np.diff(truth.times_s))) <= LONGEST_GAP_S:
+        return track
+    at_s = truth.times_s[(truth.times_s >= track.times_s[0]) & (truth.times_s <= track.times_s[-1])]
+    poses = np.column_stack([np.interp(at_s, track.times_s, column) for column in track.poses.T])
+    middle_s = 0.5 * (track.times_s[1:] + track.times_s[:-1])
+    return track._replace(times_s=at_s, poses=poses, covariances=track.covariances[np.searchsorted(middle_s, at_s)])
 
 
 def truth_at(truth: ReferencePath, times_s: FloatArray) -> FloatArray:

@@ -160,6 +160,20 @@ def running_total(amounts: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(amounts)])
 
 
+ROUNDING = 1e-3  # of an interval: times since 1970 in s have a resolution of 2e-7 s
+
+
+def first_of_each(times_s: FloatArray, interval_s: float) -> IntArray:
+    """Which of the rising times (n,) is the first one in each interval that has any, counted from the first time.
+
+    A time that rounding puts before the boundary of an interval belongs to it, so the result is the same in any epoch.
+    """
+    if not times_s.size:
+        return np.empty(0, dtype=np.int64)
+    _, first = np.unique(np.floor((times_s - times_s[0]) / interval_s + ROUNDING), return_index=True)
+    return first
+
+
 def dead_reckoned(steps: Steps, first_pose: tuple[float, float, float]) -> FloatArray:
     """Poses x_m, y_m, heading_rad at ``steps.times_s`` by odometry alone, shape (n + 1, 3).
 

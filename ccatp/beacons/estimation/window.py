@@ -33,7 +33,14 @@ from ccatp.beacons.estimation.measurement_models import ANTENNA, HEIGHT_M2
 from ccatp.beacons.estimation.motion import POSE
 from ccatp.beacons.estimation.odometry_noise import OdometryNoise, odometry_noise
 from ccatp.beacons.estimation.range_noise import range_noise
-from ccatp.beacons.estimation.recording import BeaconId, BoolArray, DelayedPath, RecordedRun, Steps
+from ccatp.beacons.estimation.recording import (
+    BeaconId,
+    BoolArray,
+    DelayedPath,
+    RecordedRun,
+    Steps,
+    first_of_each,
+)
 from ccatp.core import FloatArray
 
 SPACING_S = 0.5  # longest interval between poses without readings
@@ -101,7 +108,8 @@ def settled_square(value: float, variance: float, assumed: float, scale: float) 
     ``value``, ``variance``: its estimate under a Gaussian prior with the standard deviation ``assumed``. ``scale``:
     that of Student's t. If the readings alone tell x with the information J, the estimate under a prior of variance w
     is P J x, P = 1 / (J + 1 / w). From the core on, with one weight a solution, many solutions would be needed for a
-    value of many cores: an antenna that is elsewhere would be found metres later.
+    value of many cores: an antenna that is elsewhere would be found metres later, and an offset of the ranges be taken
+    for errors that last.
     """
     information, pull = max(1.0 / variance - assumed**-2, 1e-9), value / variance
     P = 1.0 / information
@@ -126,8 +134,7 @@ class Window:
         readings = run.readings.with_distances(cfg.radio.camera_field_rad)
         self._readings = readings.where(self._stands[readings.beacon])
         steps_s = run.steps.times_s
-        _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
-        self._grid_s = steps_s[first]
+        self._grid_s = steps_s[first_of_each(steps_s, SPACING_S)]
         self._begin_s, self._solved_s = float(steps_s[0]), float(steps_s[0])
         self._marginal: MarginalPrior | None = None
         self._last: _Solved | None = None
@@ -297,17 +304,17 @@ class Window:
 
     def _learn(self, solved: _Solved) -> None:
         """Give the prior of each calibration its weight at this solution, and estimate the noise of the odometry."""
-        free = np.flatnonzero(solved.problem.free[: len(SHARED)])
         variances = solved.problem.spread(solved.factored.shared_covariance().diagonal())
-        squares = {SHARED[k]: [solved.state.shared[k] ** 2 + variances[k]] for k in free}
-        for name in squares.keys() & ANTENNA:
-            value, variance = float(solved.state.shared[SHARED.index(name)]), float(variances[SHARED.index(name)])
-            assumed, scale = (getattr(p, name) for p in (solved.problem.priors, self._configured.priors))
-            squares[name] = [settled_square(value, variance, assumed, self._configured.priors.core * scale)]
+        squares, configured = dict[str, list[float]](), self._configured.priors
+        for k in np.flatnonzero(solved.problem.free[: len(SHARED)]).tolist():
+            if (name := SHARED[k]) in INSTRUMENTAL:
+                scale, assumed = configured.core * getattr(configured, name), getattr(solved.problem.priors, name)
+                value, variance = float(solved.state.shared[k]), float(variances[k])
+                squares[name] = [settled_square(value, variance, assumed, scale)]
         raised = solved.problem.used & self._raised
         of_heights = variances[len(SHARED) :].reshape(-1, BEACON)[raised, HEIGHT]
         squares[HEIGHT_M2] = (solved.state.beacons[raised, HEIGHT] ** 2 + of_heights).tolist()
-        priors = reweighted(self._configured.priors, squares)
+        priors = reweighted(configured, squares)
         self.odometry = odometry_noise(*solved[:3], self._configured.odometry, self.odometry, self._odometry_before)
         odometry = self.odometry.of(self._configured.odometry)
         self._cfg = self._cfg.model_copy(update={"priors": priors, "odometry": odometry})

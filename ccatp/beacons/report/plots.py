@@ -255,7 +255,7 @@ def draw_slam(
     if known:
         sigma, t = np.sqrt(np.trace(track.covariances[:, :2, :2], axis1=1, axis2=2)), track.times_s - track.times_s[0]
         panels[1].fill_between(t, 0.0, SIGMAS * sigma, color=GRID, linewidth=0.0, label="3 sigma")
-        panels[1].plot(t, judged.errors_m, color=_PATH, linewidth=0.8, label="error")
+        panels[1].plot(judged.times_s - track.times_s[0], judged.errors_m, color=_PATH, linewidth=0.8, label="error")
         top = 1.15 * max(float(np.nanmax(judged.errors_m)), 1e-6)
         panels[1].set(xlim=(0.0, t[-1]), ylim=(0.0, top), xlabel="time, s", ylabel="error, m")
     if has_residuals:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ccatp.beacons.config.models import RecordingsConfig
 from ccatp.beacons.datasets.tables import RadioDataError, Table
-from ccatp.beacons.estimation.evaluation import TrackEvaluation, judge, truth_at
+from ccatp.beacons.estimation.evaluation import TrackEvaluation, comparable, judge
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun, ReferencePath
 from ccatp.beacons.studies.recorded_sets import events_of, found_in, read_again, recorded_run, recorded_window, sets_in
 from ccatp.beacons.studies.recordings import EstimateError, estimate
@@ -324,9 +324,8 @@ def _unnumbered(line: str) -> str:
 
 def _covers(track: EstimatedPath, run: RecordedRun, judged: TrackEvaluation) -> bool:
     """Whether the covariances allow the errors of the path and of each beacon."""
-    truth = np.full((len(track.times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, track.times_s)
-    known = np.isfinite(truth[:, 0])
-    spread_m2 = np.trace(track.covariances[known, :2, :2], axis1=1, axis2=2)
+    known = np.isfinite(judged.errors_m)
+    spread_m2 = np.trace(comparable(track, run.truth).covariances[known, :2, :2], axis1=1, axis2=2)
     is_path = not known.any() or float(np.mean(judged.errors_m[known] ** 2)) < 9.0 * float(spread_m2.mean())
     errors_m = judged.beacon_errors_m
     widths_m = {name: np.sqrt(np.linalg.eigvalsh(track.beacons[name].covariance)[-1]) for name in errors_m}
