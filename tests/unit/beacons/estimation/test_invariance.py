@@ -36,10 +36,12 @@ RUN = short_run()
 
 def later(run: RecordedRun, by_s: float) -> RecordedRun:
     assert run.truth is not None
-    steps, readings, truth = (
-        part._replace(times_s=part.times_s + by_s) for part in (run.steps, run.readings, run.truth)
+    return replace(
+        run,
+        steps=run.steps._replace(times_s=run.steps.times_s + by_s),
+        readings=run.readings._replace(times_s=run.readings.times_s + by_s),
+        truth=run.truth._replace(times_s=run.truth.times_s + by_s),
     )
-    return replace(run, steps=steps, readings=readings, truth=truth)
 
 
 @pytest.mark.parametrize("name", FILTERS)
