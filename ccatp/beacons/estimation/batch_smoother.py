@@ -183,7 +183,8 @@ def smooth(
     size = problem.free.size
     covariance = np.zeros((size, size))
     covariance[np.ix_(problem.free, problem.free)] = factored.shared_covariance()
-    updates = int(counted.sum())
+    refused = int((weights[counted] < LITTLE).sum())
+    updates = int(counted.sum()) - refused
     beacons, of_map = {}, list[int]()
     for k in np.flatnonzero(start.used).tolist():
         place = slice(len(SHARED) + BEACON * k, len(SHARED) + BEACON * k + 2)
@@ -199,7 +200,7 @@ def smooth(
             warnings.append(f"{what} readings are {much}: beacons exchanged or moved on the way?")
     return EstimatedPath(
         times_s, state.poses, factored.pose_covariances(), beacons, calibration, updates=updates,
-        refused=int((weights[counted] < LITTLE).sum()), update_s=np.array([took_s / max(updates, 1)]),
+        refused=refused, update_s=np.array([took_s / max(updates, 1)]),
         warnings=tuple(warnings), map_covariance=covariance[np.ix_(of_map, of_map)],
     )  # fmt: skip
 

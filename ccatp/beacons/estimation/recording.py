@@ -256,7 +256,7 @@ class EstimatedPath(NamedTuple):
     beacons: Mapping[str, BeaconFix]
     calibration: Mapping[str, Calibrated]
     refused: int  # number of readings that were refused, or have a weight below a tenth
-    updates: int
+    updates: int  # number of the others, which were used
     warnings: tuple[str, ...]
     nis: FloatArray = np.empty(0)
     nis_sizes: FloatArray = np.empty(0)  # their degrees of freedom, shape (u,)

@@ -282,7 +282,7 @@ def test_path_beacons_and_calibration_are_found(bearings: bool) -> None:
     assert track.calibration["turn_bias_rad_s"].sigma < 0.6 * SETTINGS.priors.turn_bias_rad_s
     assert ("bearing_offset_rad" in track.calibration) is False  # it has no prior
     assert track.warnings == ()
-    assert track.updates == len(run.readings.times_s)
+    assert track.updates + track.refused == len(run.readings.times_s)
 
 
 def test_errors_are_as_large_as_the_covariance_says() -> None:
