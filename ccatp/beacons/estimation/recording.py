@@ -246,7 +246,7 @@ class EstimatedPath(NamedTuple):
 
     ``nis``: normalised innovations squared of the readings that were used, shape (u,); empty from a smoother.
     ``update_s``: elapsed time of each reading with its prediction, s; for a smoother its whole time divided by the
-    number of readings. ``scalar_s``: elapsed time of each scalar of a reading of a beacon on the map, s, without
+    number of readings in use. ``scalar_s``: elapsed time of each scalar of a reading of a beacon on the map, s, without
     prediction; empty from a smoother.
     """
 
