@@ -10,7 +10,8 @@ UNIT = TESTS / "unit"
 OF_SEVERAL_MODULES = {
     "beacons/onboard/test_package", "beacons/report/test_beacon_report", "beacons/studies/test_beacon_studies",
     "beacons/test_driving", "beacons/estimation/test_moving_beacons", "beacons/estimation/test_radios",
-    "beacons/estimation/test_invariance", "cli/test_cli_commands", "cli/test_outputs", "cli/test_refusals", "daemon/test_service", "daemon/test_telemetry",
+    "beacons/estimation/test_invariance", "cli/test_cli_commands", "cli/test_outputs", "cli/test_refusals",
+    "daemon/test_service", "daemon/test_telemetry",
     "beacons/cli/test_radio_map", "control/test_tracker_pid", "estimation/test_replay_buffer",
     "estimation/test_sample_validation", "mirror/test_length_judgement", "report/test_pages",
     "report/dashboard/test_views", "safety/test_columns_act", "safety/test_conditions", "safety/test_united_findings",
