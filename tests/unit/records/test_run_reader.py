@@ -401,7 +401,7 @@ def test_a_path_is_exported_as_a_trajectory(
     begin, end = ([*map(float, line.split())] for line in estimates.read_text().splitlines())
     assert end[0] - begin[0] == pytest.approx(0.01)
     assert hypot(end[1] - begin[1], end[2] - begin[2]) == pytest.approx(0.001, abs=1e-6)  # along a panel that is tilted
-    assert "--tum: cannot write" in refused(capsys, "recording", "export", run, "--tum", tmp_path / "none" / "e.tum")
+    assert "--tum: no directory" in refused(capsys, "recording", "export", run, "--tum", tmp_path / "none" / "e.tum")
     other = tmp_path / "robot"
     record(other, messages, config=config_text)
     (other / "config.toml").write_text(config_text, encoding="utf-8")

@@ -376,16 +376,19 @@ def by_both(run: RecordedRun, **priors: float) -> list[EstimatedPath]:
 
 
 def test_filter_and_smoother_mean_the_same_by_a_name() -> None:
-    run = recorded(world(3, 120.0))
-    turn_rad = 0.92 * run.steps.turn_rad
-    more = run.steps._replace(distance_m=1.1 * (run.steps.distance_m + 0.06 * np.abs(turn_rad)), turn_rad=turn_rad)
-    priors = {"distance_scale": 0.2, "distance_per_rad": 0.2, "turn_scale": 0.2, "odometry_delay_s": 0.2}
-    tracks = by_both(replace(run, steps=more), **priors)
-    for track in tracks:
-        assert track.calibration["distance_scale"].value == pytest.approx(0.1, abs=0.03)
-        assert track.calibration["distance_per_rad"].value == pytest.approx(0.06, abs=0.02)
-        assert track.calibration["turn_scale"].value == pytest.approx(-0.08, abs=0.03)
-        assert track.calibration["odometry_delay_s"].value == pytest.approx(0.0, abs=0.05)
+    """In the mean of three runs: one tells the scale of the distance to 0.03 alone."""
+    true = {"distance_scale": 0.1, "distance_per_rad": 0.06, "turn_scale": -0.08, "odometry_delay_s": 0.0}
+    within = {"distance_scale": 0.03, "distance_per_rad": 0.02, "turn_scale": 0.03, "odometry_delay_s": 0.05}
+    found: dict[str, list[list[float]]] = {name: [] for name in true}
+    for seed in (3, 4, 5):
+        run = recorded(world(seed, 120.0))
+        turn_rad = 0.92 * run.steps.turn_rad
+        more = run.steps._replace(distance_m=1.1 * (run.steps.distance_m + 0.06 * np.abs(turn_rad)), turn_rad=turn_rad)
+        tracks = by_both(replace(run, steps=more), **dict.fromkeys(true, 0.2))
+        for name, values in found.items():
+            values.append([track.calibration[name].value for track in tracks])
+    for name, values in found.items():
+        assert np.mean(values, axis=0) == pytest.approx(true[name], abs=within[name]), name
 
 
 def test_ranges_by_height_are_depths_where_a_camera_reads_them() -> None:
