@@ -242,7 +242,7 @@ def _align_points(
 
     _check_effect(settings, (*ALIGN_KEYS, "run.mirror"), "the alignment of points")
     found = align_points(run_dir, settings, options)
-    measured = len(found.assigned.measured)
+    measured = len(found.assigned.labels)
     facts = {
         "run_dir": str(options.points),
         "points_file": str(options.points),
@@ -283,17 +283,17 @@ def _write_files(cfg: "Config", mirror: "Mirror", result: "SurveyResult", files:
     from ccatp.mirror.adjuster_work import work_list
     from ccatp.report.tables import csv_lines, panel_table, work_table
 
-    refused: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     if files.csv is not None:
         common.write_lines("--csv", files.csv, csv_lines(panel_table(mirror, result.panels)))
     if files.work is not None:
-        steps, refused = work_list(mirror, cfg.mirror.adjusters, result.panels)
+        steps, warnings = work_list(mirror, cfg.mirror.adjusters, result.panels)
         common.write_lines("--work-list", files.work, csv_lines(work_table(steps)))
     if files.figure is not None:
         from ccatp.report.mirror_map import draw_alignment
 
         draw_alignment(mirror, result, files.figure, f"{mirror.name}: {len(result.panels)} panels", name)
-    return refused
+    return warnings
 
 
 def _measured_with(run_dir: Path, cfg: "Config", settings: Mapping[str, object]) -> "Sequence[Measured]":

@@ -568,9 +568,7 @@ class AdjustersConfig(Model):
     order: Literal["manufacturer", "observatory"] = "manufacturer"  # whose names the adjusters have
     pitch_mm: NonNegative = 0.0  # move per turn of a screw
     travel_mm: NonNegative = 0.0  # largest move of an adjuster in one work list
-    step_mm: NonNegative = (
-        0.0  # largest move of an adjuster in one round, in which all adjusters of the panel are moved once
-    )
+    step_mm: NonNegative = 0.0  # largest move of an adjuster in one round; each round moves all adjusters of a panel
 
 
 class BaseConfig(Model):

@@ -11,7 +11,7 @@ from ccatp.core import PanelId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import PanelResult, adjuster_places
 
-_MEANING = 3.0  # standard deviations of a move from which it is worth a turn
+_SIGNIFICANT = 3.0  # standard deviations of a move from which it counts
 _NAMED = 12  # largest number of panels that a message names
 
 
@@ -35,10 +35,10 @@ class Step(NamedTuple):
 
 
 class WorkList(NamedTuple):
-    """The steps of panels, and as texts which panels have none: moves beyond the travel, or of no meaning."""
+    """The steps of panels, and warnings: panels without steps, and moves that are not significant."""
 
     steps: tuple[Step, ...]
-    refused: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult]) -> WorkList:
@@ -47,7 +47,7 @@ def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult
     Panels whose points do not decide have none, and panels whose largest move is not three times the largest of their
     standard deviations: their adjusters would follow the noise.
     """
-    steps, refused = list[Step](), list[str]()
+    steps, warnings = list[Step](), list[str]()
     undecided, unclear = list[PanelId](), list[PanelId]()
     travel_m, step_m, pitch_m = (1e-3 * value for value in (cfg.travel_mm, cfg.step_mm, cfg.pitch_mm))
     for panel in panels:
@@ -56,11 +56,11 @@ def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult
         if panel.deciding is not None:
             undecided.append(panel.panel)
             continue
-        if abs(moves.values_m[worst]) < _MEANING * float(moves.sigma_m.max()):
+        if abs(moves.values_m[worst]) < _SIGNIFICANT * float(moves.sigma_m.max()):
             unclear.append(panel.panel)
             continue
         if travel_m and abs(moves.values_m[worst]) > travel_m:
-            refused.append(
+            warnings.append(
                 f"panel {panel.panel.row}/{panel.panel.col}: {panel.adjusters[worst]} has to move by "
                 f"{1e3 * moves.values_m[worst]:+.3f} mm, its travel is {cfg.travel_mm:g} mm: it is not in the work list"
             )
@@ -73,24 +73,24 @@ def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult
             ):
                 part = move / max(rounds, 1)
                 turns = part / pitch_m if pitch_m else None
-                is_significant = abs(move) >= _MEANING * sigma
+                is_significant = abs(move) >= _SIGNIFICANT * sigma
                 steps.append(
                     Step(panel.panel, number, max(rounds, 1), name, x_m, y_m, part, sigma, is_significant, turns)
                 )
     small = sum(not step.is_significant for step in steps if step.round == 1)
     if undecided:
-        refused.append(f"not in the work list, as their points do not decide: panels {_names(undecided)}")
+        warnings.append(f"not in the work list, as their points do not decide: panels {_names(undecided)}")
     if unclear:
-        refused.append(
-            f"not in the work list, as no move is {_MEANING:g} times the largest standard deviation of the panel's "
+        warnings.append(
+            f"not in the work list, as no move is {_SIGNIFICANT:g} times the largest standard deviation of the panel's "
             f"moves: panels {_names(unclear)}"
         )
     if small:
-        refused.append(
-            f"{small} moves of the work list are less than {_MEANING:g} times their standard deviation (is_significant "
-            "0): they complete the plane of their panel"
+        warnings.append(
+            f"{small} moves of the work list are less than {_SIGNIFICANT:g} times their standard deviation "
+            "(is_significant 0): they complete the plane of their panel"
         )
-    return WorkList(tuple(steps), tuple(refused))
+    return WorkList(tuple(steps), tuple(warnings))
 
 
 def _names(panels: Sequence[PanelId]) -> str:

@@ -19,7 +19,7 @@ LARGEST_SIDESLIP_RAD = 0.3  # a smaller constant difference is sideslip; a large
 CONSTANT_RAD = 1e-6  # span of a heading that never changes
 TURNED_RAD = 0.5  # by the odometry meanwhile
 FEWEST_CHORDS = 20
-DRIFTS = 40  # chords, after which the heading of the odometry is taken anew
+DRIFTS = 40  # chords of a piece, in each of which the odometry has a heading of its own: it drifts
 STRAIGHT = 0.95  # length of the mean vector of the course above which the path does not turn
 PIECE_S = 10.0  # long enough for one or two turns, short enough for the drift of odometry
 PIECE_POINTS = 40
@@ -139,9 +139,9 @@ CONTRADICTS = 0.5  # length of its mean vector, below which headings have little
 def heading_as_written(truth: ReferencePath, steps: Steps, warnings: list[str], *, turns: bool = True) -> FloatArray:
     """The heading of a truth, rad, counter-clockwise from x, continuous, shape (k,), whatever its unit and direction.
 
-    What it is, is told by the course of the truth, and for a direction of turning by the odometry, too: it must turn as
-    the course does. If the headings contradict a course with which the odometry agrees, they are NaN. ``turns``:
-    whether to change them; else there is only the warning. ``truth``: with headings as they were written.
+    The course of the truth decides between the ways of writing. To reverse the direction of turning, the odometry must
+    turn as the course does, too. If the headings contradict a course with which the odometry agrees, they are NaN.
+    ``turns``: whether to change them; else there is only the warning. ``truth``: with headings as they were written.
     """
     as_is = np.unwrap(truth.heading_rad)
     rows = chords(truth, steps)

@@ -129,7 +129,8 @@ class Window:
     def __init__(self, run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, lag: FixedLagConfig) -> None:
         self._run, self._lag, self._spacing_s = run, lag, lag.lag_s / lag.poses
         self._rest = how.rest_speed_m_s, how.rest_turn_rad_s
-        self._doubtful = how.doubt_pose_after - 1  # refusals in a row
+        self._doubtful = max(how.doubt_pose_after - 1, 1)  # refusals in a row
+        self._was_doubtful = False
         self._stands = np.array([name not in run.moving for name in run.beacon_ids])  # others are the filter's alone
         readings = run.readings.with_distances(cfg.radio.camera_field_rad)
         self._readings = readings.where(self._stands[readings.beacon])
@@ -168,7 +169,8 @@ class Window:
         self._solved_s = time_s if joins or not placed else self._solved_s
         # Refused readings may be good ones, linearised too far off: solve before the filter doubts its pose.
         is_doubtful = slam.refused_in_a_row >= self._doubtful
-        if joins or (placed and (time_s >= self._due_s or is_doubtful)):
+        begins_to_doubt, self._was_doubtful = is_doubtful and not self._was_doubtful, is_doubtful
+        if joins or (placed and (time_s >= self._due_s or begins_to_doubt)):
             self.solve(time_s, slam, times_s, poses)
             self._placed = frozenset(map(str, slam.beacons)) - {*self._run.moving}
 
@@ -349,7 +351,7 @@ class Window:
     def _restart(self, time_s: float, slam: BeaconSlam) -> None:
         """Begin a window now, with the filter's estimate as its prior."""
         self._hand_over(np.inf)
-        self._odometry_before = self.odometry
+        self._odometry_before, self._was_doubtful = self.odometry, False
         used = self._stands & [name in slam.beacons for name in self._run.beacon_ids]
         names, placed = list(slam.calibration), np.flatnonzero(used).tolist()
         shared, beacons = np.zeros(len(SHARED)), np.zeros((len(used), BEACON))

@@ -53,8 +53,8 @@ def after(turned: dict[str, float], seed: int = 2) -> PanelResult:
 
 
 def test_the_steps_add_up_to_the_moves_and_exceed_no_limit() -> None:
-    steps, refused = work_list(M1, AdjustersConfig(pitch_mm=0.5, step_mm=0.03), [BEFORE])
-    assert refused == ()
+    steps, warnings = work_list(M1, AdjustersConfig(pitch_mm=0.5, step_mm=0.03), [BEFORE])
+    assert warnings == ()
     total, by_round = defaultdict[str, float](float), defaultdict[int, list[float]](list)
     for step in steps:
         total[step.adjuster] += step.move_m

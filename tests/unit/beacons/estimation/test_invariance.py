@@ -83,6 +83,15 @@ def test_a_sparse_truth_judges_as_a_dense_one_does() -> None:
     assert found.heading_rmse_rad == pytest.approx(dense.heading_rmse_rad, rel=0.3)
 
 
+def test_a_sparse_truth_of_another_time_judges_nothing() -> None:
+    assert RUN.truth is not None
+    track = estimate(RUN, CONFIG, "ekf-slam")
+    truth = ReferencePath(*(column[::30] for column in RUN.truth))
+    found = judge(track, replace(RUN, truth=truth._replace(times_s=truth.times_s + 1e3)))
+    assert found.trajectory_rmse_m is None
+    assert found.nees is None
+
+
 @pytest.mark.parametrize("offset_m", [0.0, 0.4])
 def test_a_calibration_is_within_its_stated_deviation(offset_m: float) -> None:
     """Even if the readings determine it too little to be taken for other than that of a good instrument."""

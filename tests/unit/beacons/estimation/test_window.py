@@ -1,6 +1,7 @@
 """The fixed-lag smoother: its window beside the smoother of the whole run, what is marginalised, and learned noise."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from ccatp.beacons.estimation.measurement_models import ANTENNA
 from ccatp.beacons.estimation.range_noise import correlations, range_noise, readings_as_one
 from ccatp.beacons.estimation.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.estimation.track_review import range_residuals
-from ccatp.beacons.estimation.window import reweighted, settled_square
+from ccatp.beacons.estimation.window import Window, reweighted, settled_square
 from ccatp.beacons.filters.ekf_slam import EkfSlam
 from ccatp.beacons.studies.trait_runs import trait_run
 from ccatp.core import FloatArray
@@ -91,6 +92,27 @@ def test_readings_that_the_filter_alone_would_refuse_are_linearised_again_first(
     at = found.path.times_s <= 72.0
     off_m = found.path.poses[at, :2] - truth_at(run.truth, found.path.times_s[at])[:, :2]
     assert np.hypot(*off_m.T)[-20:].max() < 1.0  # without: 1.9 m, and a heading off by 0.8 rad
+
+
+def test_without_further_readings_it_doubts_them_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two readings are refused, and nothing is received for twenty seconds after them."""
+    run = trait_run((), 0)
+    last = int(np.searchsorted(run.readings.times_s, 40.0))
+    wrong = run.readings.where(np.arange(run.readings.times_s.size) < last)
+    wrong.range_m[-2:] += 5.0
+    count = int(np.searchsorted(run.steps.times_s, 60.0))
+    moves = {name: getattr(run.steps, name)[:count] for name in ("distance_m", "turn_rad", "lateral_m")}
+    run = replace(run, readings=wrong, steps=run.steps._replace(times_s=run.steps.times_s[: count + 1], **moves))
+    solved_s, solve = list[float](), Window.solve
+
+    def counted(self: Window, time_s: float, *rest: Any) -> None:
+        solved_s.append(time_s)
+        solve(self, time_s, *rest)
+
+    monkeypatch.setattr(Window, "solve", counted)
+    follow(run, CONFIG.csv, CONFIG.filter, no_clock, lag=CONFIG.fixed_lag)
+    assert any(40.0 < at_s < 41.5 for at_s in solved_s)
+    assert sum(at_s > 41.5 for at_s in solved_s) < 8  # 19 if it doubts them once a second
 
 
 def test_it_is_consistent_where_errors_last_and_says_that_they_do() -> None:
