@@ -273,7 +273,7 @@ def adjuster_moves(fit: ModeFit, modes: Modes, places_m: FloatArray) -> Moves:
     return Moves(at @ fit.values, at @ fit.covariance @ at.T, at @ fit.common)
 
 
-_CURVATURES = 3
+CURVATURES = 3
 # Number of redundant points required for each point left out. With fewer, some selection of points always fits.
 REDUNDANCY = 3
 # Points that are left out at most, and number of points from which it is one: the selections are tried one by one.
@@ -295,7 +295,7 @@ class Prices(NamedTuple):
 def prices(false_alarm: float, points: int, panels: int) -> Prices:
     """The prices for a ``false_alarm`` probability of an outlier, or of a shape, by noise on the whole mirror."""
     of_panel = false_alarm / max(panels, 1)
-    return Prices(float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, of_panel)), of_panel)
+    return Prices(float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(CURVATURES, of_panel)), of_panel)
 
 
 class Explanation(NamedTuple):
@@ -330,7 +330,7 @@ def explain(deviations: Deviations, price: Prices) -> tuple[Explanation, ...]:
     """
     found = _explanations(deviations, price)
     if not found:
-        return (_plain(deviations),)
+        return (plain(deviations),)
     best, *others = found
     if best.is_plain:
         return (best,)
@@ -388,12 +388,12 @@ def _most_left_out(deviations: Deviations, needed: int) -> int:
     return most
 
 
-def _plain(deviations: Deviations) -> Explanation:
+def plain(deviations: Deviations) -> Explanation:
     """A rigid panel with all its points."""
     return Explanation(np.ones(len(deviations.points), dtype=np.bool_), has_shape=False, cost=np.inf)
 
 
-def _contradicts(one: Explanation, price: Prices) -> bool:
+def contradicts(one: Explanation, price: Prices) -> bool:
     """Whether the points that an explanation keeps contradict each other nevertheless."""
     kept = int(np.count_nonzero(one.is_kept))
     dof = kept - (6 if one.has_shape else 3)
@@ -595,9 +595,9 @@ def panel_result(
     """Fit a panel; None if its points do not determine piston, tip and tilt."""
     explanations = explain(deviations, price)
     factor = 1.0
-    if _contradicts(explanations[0], price):
+    if contradicts(explanations[0], price):
         # No explanation holds: the points scatter as they do.
-        explanations = (_plain(deviations),)
+        explanations = (plain(deviations),)
         every = fit_modes(
             deviations.lever[:, None] * rigid(deviations.places_m), deviations.values_m, deviations.sigmas_m
         )
@@ -627,7 +627,7 @@ def panel_result(
     if full is not None:
         plane = fit_modes(lever * rigid(places), values, sigmas)
         gain = 0.0 if plane is None else plane.chi2 - full.chi2
-        chance = float(chdtrc(_CURVATURES, max(gain, 0.0)))
+        chance = float(chdtrc(CURVATURES, max(gain, 0.0)))
         values_1_m, sigma_1_m = full.values[SHAPE], full.sigma[SHAPE]
         shape = PanelShape(values_1_m, sigma_1_m, gain, chance, full.chi2, full.dof, has_shape)
     return PanelResult(
@@ -658,7 +658,7 @@ def _fit_of(deviations: Deviations, one: Explanation, modes: Modes, half_m: tupl
 
 def all_points(deviations: Deviations) -> ModeFit | None:
     """The fit of all points, with curvatures if that leaves redundant points as for one outlier."""
-    modes = quadratic if len(deviations.points) >= _SIX.shape[0] + REDUNDANCY else rigid
+    modes = quadratic if len(deviations.points) >= 3 + CURVATURES + REDUNDANCY else rigid
     return fit_modes(deviations.lever[:, None] * modes(deviations.places_m), deviations.values_m, deviations.sigmas_m)
 
 
