@@ -28,7 +28,7 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.network_adjustment import NetworkResult, NetworkState, calibrate
 from ccatp.mirror.network_model import Effect, EffectKind, SurveyLengths, adjust, equal_effects
-from ccatp.mirror.panel_alignment import rigid
+from ccatp.mirror.panel_modes import rigid
 
 MIRRORS = ("thesis-m1", "fyst-m1", "fyst-m2", "thesis-m2")
 

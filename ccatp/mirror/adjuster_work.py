@@ -9,7 +9,8 @@ import numpy as np
 from ccatp.config.models import AdjustersConfig
 from ccatp.core import PanelId
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.panel_alignment import PanelResult, adjuster_places
+from ccatp.mirror.panel_alignment import PanelResult
+from ccatp.mirror.panel_modes import adjuster_places
 
 _SIGNIFICANT = 3.0  # standard deviations of a move from which it counts
 _NAMED = 12  # largest number of panels that a message names

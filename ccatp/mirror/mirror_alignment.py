@@ -14,18 +14,15 @@ from ccatp.core import UNRELIABLE, FloatArray, Measured, PanelId, PointId, Vecto
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.network_points import CalibratedSurveys, calibrate_surveys
 from ccatp.mirror.panel_alignment import (
-    Deviations,
-    Explanation,
     MirrorWavefront,
     PanelResult,
-    Prices,
     all_points,
     cos_incidence,
-    deviations_of,
     mirror_wavefront,
     panel_result,
-    prices,
 )
+from ccatp.mirror.panel_explanations import Explanation, Prices, prices
+from ccatp.mirror.panel_modes import Deviations, deviations_of
 from ccatp.mirror.surface import ConvergenceError
 
 ENOUGH = 3  # points of a plane

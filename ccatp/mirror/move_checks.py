@@ -10,7 +10,8 @@ from scipy.special import chdtrc, erfc
 
 from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.panel_alignment import Moves, PanelResult, adjuster_places, rigid
+from ccatp.mirror.panel_alignment import PanelResult
+from ccatp.mirror.panel_modes import Moves, adjuster_places, rigid
 
 _SIGMAS = 4.0  # of a difference that noise does not make in the several hundred adjusters of a mirror
 _FALSE_ALARM = float(erfc(_SIGMAS / np.sqrt(2.0)))

@@ -8,14 +8,8 @@ import numpy as np
 from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult
-from ccatp.mirror.panel_alignment import (
-    MirrorWavefront,
-    PanelResult,
-    adjuster_places,
-    half_size_m,
-    mirror_wavefront,
-    rigid,
-)
+from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, half_size_m, mirror_wavefront
+from ccatp.mirror.panel_modes import adjuster_places, rigid
 from ccatp.report.html import MICRO, render
 
 _DECIMALS = 4

@@ -17,7 +17,8 @@ from matplotlib.patches import Polygon, Rectangle
 from ccatp.core import FloatArray, StopKind
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import SurveyResult
-from ccatp.mirror.panel_alignment import PanelResult, adjuster_places, on_grid_m
+from ccatp.mirror.panel_alignment import PanelResult, on_grid_m
+from ccatp.mirror.panel_modes import adjuster_places
 from ccatp.report import plots
 from ccatp.report.findings import Grade, PointVerdict, point_verdicts
 from ccatp.report.plots import BAD, INK, PANEL, PAPER, PATH, PX_PER_IN, QUIET, SEAM, PictureError, add_legend, is_wide

@@ -15,7 +15,8 @@ from ccatp.config.files import write_file
 from ccatp.core import PointId
 from ccatp.mirror.adjuster_work import Step
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.panel_alignment import PanelResult, adjuster_places
+from ccatp.mirror.panel_alignment import PanelResult
+from ccatp.mirror.panel_modes import adjuster_places
 from ccatp.report.alignment import panel_data, worst_corner
 from ccatp.report.findings import Findings, fix_times_s, metadata_of
 

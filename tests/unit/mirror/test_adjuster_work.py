@@ -13,7 +13,8 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.mirror_alignment import survey_result
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.mirror.move_checks import Made, check_moves, made_of
-from ccatp.mirror.panel_alignment import PanelResult, adjustable, adjuster_places, rigid
+from ccatp.mirror.panel_alignment import PanelResult
+from ccatp.mirror.panel_modes import adjustable, adjuster_places, rigid
 from tests.support.scenario import world_of
 
 HEIGHT_M = 0.05

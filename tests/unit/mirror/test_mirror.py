@@ -12,7 +12,7 @@ from ccatp.kinematics import bearing, difference
 from ccatp.mirror.layout import PanelGrid
 from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
-from ccatp.mirror.panel_alignment import deviations_of
+from ccatp.mirror.panel_modes import deviations_of
 from ccatp.mirror.surface import ConvergenceError, UnknownPanelError
 from tests.unit.mirror.test_panel_alignment import exact_fix
 

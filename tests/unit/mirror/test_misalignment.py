@@ -14,7 +14,8 @@ from ccatp.core import DeckPose, FloatArray, Measured, PanelId
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.multilateration import MultilaterationError, multilaterate, solve_fix
-from ccatp.mirror.panel_alignment import deviations_of, fit_panels
+from ccatp.mirror.panel_alignment import fit_panels
+from ccatp.mirror.panel_modes import deviations_of
 from tests.unit.mirror.test_panel_alignment import exact_fix
 
 HEIGHT_M = 0.05

@@ -21,24 +21,25 @@ from ccatp.mirror.mirror_alignment import SurveyResult, compare, survey_result
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.multilateration import solve_fix
 from ccatp.mirror.panel_alignment import (
-    Deviations,
-    Modes,
     PanelResult,
     PanelWavefront,
-    adjustable,
-    adjuster_moves,
-    adjuster_places,
     cos_incidence,
-    deviations_of,
-    explain,
-    fit_bent,
-    fit_modes,
     fit_panels,
-    gram,
     half_size_m,
     mirror_wavefront,
     panel_result,
-    prices,
+)
+from ccatp.mirror.panel_explanations import explain, prices
+from ccatp.mirror.panel_modes import (
+    Deviations,
+    Modes,
+    adjustable,
+    adjuster_moves,
+    adjuster_places,
+    deviations_of,
+    fit_bent,
+    fit_modes,
+    gram,
     quadratic,
     rigid,
 )
