@@ -1,5 +1,6 @@
 """The page in Chromium before a played daemon: what an operator sees, and what is sent when a button is pressed."""
 
+import asyncio
 import json
 import re
 import shutil
@@ -62,26 +63,29 @@ proto.arc = function (x, y, r, ...rest) {
 
 
 class Operator:
-    """A browser at the page of a played daemon, which lives as long as something is awaited here."""
+    """A browser at the page of a played daemon; its loops report all the time, unless they are ``silent``."""
 
     def __init__(self, page: Page, rig: Rig, folder: Path) -> None:
         self.page, self.rig, self.folder = page, rig, folder
         self.status: dict[str, Any] = {}
+        self.silent = False
 
     async def until(self, script: str, wanted: object) -> None:
         """Evaluate until the result is as wanted."""
         found: object = None
         for _ in range(400):
-            self.live()
             found = await self.page.evaluate(script)
             if found == wanted:
                 return
             await self.page.wait_for_timeout(50)
         raise AssertionError(f"{script}: {found}, not {wanted}")
 
-    def live(self) -> None:
+    async def report(self) -> None:
         """Both loops report; the mission is as in ``status``."""
-        self.rig.tell_alive(line=LINE, **{"t_s": 0.0, **self.status})
+        while True:
+            if not self.silent:
+                self.rig.tell_alive(line=LINE, **{"t_s": 0.0, **self.status})
+            await asyncio.sleep(0.05)
 
     async def until_text(self, where: str, wanted: str) -> None:
         """Wait until the text of an element is this."""
@@ -98,8 +102,14 @@ async def operator_at(folder: Path, size: tuple[int, int] = (1440, 900)) -> Asyn
         page.on("pageerror", lambda error: errors.append(str(error)))
         await page.add_init_script(SPY)
         await page.goto(f"http://127.0.0.1:{rig.port}/?token={rig.token}")
-        yield Operator(page, rig, folder)
-        await browser.close()
+        operator = Operator(page, rig, folder)
+        reports = asyncio.create_task(operator.report())
+        try:
+            yield operator
+        finally:
+            reports.cancel()
+            await asyncio.wait([reports])
+            await browser.close()
     assert errors == []
 
 
@@ -177,10 +187,12 @@ async def test_the_commands_do_not_move_while_one_is_pressed_and_a_double_click_
     before = await operator.page.evaluate(place)
     await operator.page.locator("#abort").click()
     await operator.until_text("#abort", "Confirm?")
-    await operator.page.wait_for_selector("#alarm:not([hidden])")  # nothing is heard of the loops meanwhile
+    operator.silent = True
+    await operator.page.wait_for_selector("#alarm:not([hidden])")
     assert await operator.page.evaluate(place) == before
     assert operator.rig.asked == []
     await operator.page.locator("#abort").click()
+    operator.silent = False
     await operator.until_text("#answer", "abort: done")
     assert [one["cmd"] for one in operator.rig.asked] == ["abort"]
     operator.status = held("paused", "operator", "resume", OPERATOR.cause(by="eva"), "resume", *offers)
@@ -279,7 +291,6 @@ async def test_plots_are_zoomed_by_dragging_and_keep_their_history_when_the_page
     operator: Operator,
 ) -> None:
     operator.status = {"t_s": 0.0, "elapsed_s": 0.0}
-    operator.live()
     await operator.until("document.querySelector('#plot-jump').closest('figure').hidden", True)
     await operator.page.locator("#engineer").check()
     for k in range(100):
