@@ -1,6 +1,5 @@
 """Fixtures of all tests: nothing may outlive its test."""
 
-import asyncio
 import gc
 import inspect
 import os
@@ -17,6 +16,7 @@ from hypothesis import settings
 
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
+from tests.support.leaks import no_new_tasks
 from tests.support.runs import RecordedRun, record_once
 from tests.support.scenario import config_of, mirror_of
 from tests.support.temporary import session_folder
@@ -34,8 +34,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # Processes that end on their own after a test closed its side of them.
 GRACE_S = 2.0
-# Passes of the event loop that cancelled tasks and closing transports get to finish.
-GRACE_PASSES = 10
 
 
 @pytest.hookimpl(wrapper=True)
@@ -85,6 +83,7 @@ def nothing_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
         shown = ", ".join(_describe(child) for child in leaked)
         _, alive = psutil.wait_procs(leaked, timeout=GRACE_S)
         if alive:
+            alive += [below for child in alive for below in child.children(recursive=True)]
             for child in alive:
                 child.kill()
             psutil.wait_procs(alive, timeout=GRACE_S)
@@ -94,23 +93,22 @@ def nothing_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture
 async def no_task_leaks() -> AsyncIterator[None]:
     """Fail when tasks are left in the event loop of the test. Set up for each asyncio test."""
-    before = asyncio.all_tasks()
-    yield
-    for _ in range(GRACE_PASSES):
-        await asyncio.sleep(0)
-    if leaked := asyncio.all_tasks() - before - {asyncio.current_task()}:
-        pytest.fail(f"asyncio tasks left behind: {', '.join(sorted(map(repr, leaked)))}")
+    async with no_new_tasks():
+        yield
 
 
 def _children() -> set[psutil.Process]:
-    """Child processes of this one; multiprocessing keeps one helper of its own for good."""
+    """Child processes of this one; multiprocessing keeps one helper of its own for good.
+
+    Those below them are theirs: a browser that several tests share starts processes when it likes.
+    """
     try:
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:  # there are none, which is quicker to find out than to look at all processes
         return set()
     return {
         child
-        for child in psutil.Process(os.getpid()).children(recursive=True)
+        for child in psutil.Process(os.getpid()).children()
         if "multiprocessing.resource_tracker" not in _describe(child)
     }
 

@@ -5,13 +5,13 @@ import json
 import re
 import shutil
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-from playwright.async_api import Page, async_playwright, expect
+import pytest_asyncio
+from playwright.async_api import Browser, Page, async_playwright, expect
 
 from ccatp.conditions import text_of
 from ccatp.conditions.danger import EMERGENCY, ENCODERS_STALE, WHEEL_BLOCKED
@@ -20,10 +20,15 @@ from ccatp.config.load import load_config
 from ccatp.core import Cause
 from ccatp.links.topics import Alarm, FixMessage, TrackMessage, Turn
 from ccatp.report.dashboard.history import Growing
+from tests.support.leaks import no_new_tasks
 from tests.support.page_rig import Rig, page_rig
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page is not tried in a browser")
+# One event loop of the file: it is that of its one browser.
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page is not tried in a browser"),
+    pytest.mark.asyncio(loop_scope="module"),
+]
 CFG = load_config(
     None,
     {
@@ -92,31 +97,41 @@ class Operator:
         await self.until(f"document.querySelector({json.dumps(where)})?.textContent", wanted)
 
 
-@asynccontextmanager
-async def operator_at(folder: Path, size: tuple[int, int] = (1440, 900)) -> AsyncIterator[Operator]:
-    errors: list[str] = []
-    async with async_playwright() as playwright, page_rig(CFG, folder) as rig:
+@pytest_asyncio.fixture(loop_scope="module")
+async def no_task_leaks() -> AsyncIterator[None]:
+    """As everywhere, in the event loop of this file."""
+    async with no_new_tasks():
+        yield
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def browser() -> AsyncIterator[Browser]:
+    async with async_playwright() as playwright:
         browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = await browser.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme="dark")
+        yield browser
+        await browser.close()
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def operator(browser: Browser, runtime_dir: Path) -> AsyncIterator[Operator]:
+    errors: list[str] = []
+    async with page_rig(CFG, runtime_dir) as rig:
+        # A context of its own: nothing is remembered from the page of another test.
+        context = await browser.new_context(viewport={"width": 1440, "height": 900}, color_scheme="dark")
+        page = await context.new_page()
         page.set_default_timeout(20_000)
         page.on("pageerror", lambda error: errors.append(str(error)))
         await page.add_init_script(SPY)
         await page.goto(f"http://127.0.0.1:{rig.port}/?token={rig.token}")
-        operator = Operator(page, rig, folder)
+        operator = Operator(page, rig, runtime_dir)
         reports = asyncio.create_task(operator.report())
         try:
             yield operator
         finally:
             reports.cancel()
             await asyncio.wait([reports])
-            await browser.close()
+            await context.close()
     assert errors == []
-
-
-@pytest.fixture
-async def operator(runtime_dir: Path) -> AsyncIterator[Operator]:
-    async with operator_at(runtime_dir) as operator:
-        yield operator
 
 
 async def test_the_map_shows_the_planned_points_then_the_whole_mirror(operator: Operator) -> None:
