@@ -95,7 +95,7 @@ def slam(
     from ccatp.beacons.datasets.reader import read_run
     from ccatp.beacons.estimation.evaluation import judge, result_data, table_lines
     from ccatp.beacons.estimation.track_review import review_lines, reviewed
-    from ccatp.beacons.studies.recordings import COMPARED, compared, estimate
+    from ccatp.beacons.studies.recordings import COMPARED, compared, estimate, settings_of
     from ccatp.studies.results import markdown_table
 
     assumed = load_recordings_config(config_file, settings)
@@ -110,20 +110,20 @@ def slam(
     track = estimate(run, assumed, filter_name)
     common.warn(track.warnings)
     judged = judge(track, run)
-    noise = getattr(assumed, run.kind).radio
-    data: dict[str, Any] = result_data(run, filter_name, track, judged) | reviewed(run, track, noise)
+    used = settings_of(run, assumed)
+    data: dict[str, Any] = result_data(run, filter_name, track, judged) | reviewed(run, track, used.radio)
     if tum_file is not None:
         _write_tum(tum_file, run, track)
     if out_dir is not None:
         from ccatp.beacons.report.slam_files import write_slam
 
-        write_slam(out_dir, run, track, getattr(assumed, run.kind))
+        write_slam(out_dir, run, track, used)
         if run.tags:
             common.warn(["graph.pyfg is not written: the format has no places of several tags on the vehicle"])
     if figure_file is not None:
         from ccatp.beacons.report.plots import draw_slam
 
-        draw_slam(run, track, judged, noise.camera_field_rad, figure_file, f"{run.name}, {filter_name}")
+        draw_slam(run, track, judged, used.radio.camera_field_rad, figure_file, f"{run.name}, {filter_name}")
     if peers:
         data["peers"] = compared(run, assumed, common.warn, partial(_progress, what="instants of GTSAM"))
     if json_output:

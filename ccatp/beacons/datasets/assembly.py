@@ -8,9 +8,9 @@ import numpy as np
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.events import EVENTS, MOTIONS, READING_KINDS, Recording
 from ccatp.beacons.datasets.ordering import in_seconds, ordered
-from ccatp.beacons.datasets.placeholders import frozen, measured, true_positions, without_wild_steps
+from ccatp.beacons.datasets.placeholders import frozen, measured, step_of, true_positions, without_wild_steps
 from ccatp.beacons.datasets.tables import RadioDataError, Table, instant, listed, long_pauses, needed_of, plural, within
-from ccatp.beacons.datasets.tags import radios_of
+from ccatp.beacons.datasets.tags import from_the_vehicle, radios_of
 from ccatp.beacons.datasets.trajectory import (
     BEFORE_S,
     at_antenna,
@@ -50,8 +50,10 @@ def checked_run(
 
 
 def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) -> RecordedRun:
-    file, names, warnings = recording.file, recording.names, list(recording.warnings)
+    warnings = list(recording.warnings)
     _check_complete(recording)
+    recording = from_the_vehicle(recording, warnings)
+    file, names = recording.file, recording.names
     radios = radios_of(recording, tag, warnings)
     tables = dict(recording.tables) | radios.tables
     surveyed, *_ = (tables.pop(kind, None) for kind in ("beacon", "antenna", "tag"))
@@ -62,7 +64,7 @@ def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) 
     odometry = _with_truth(_known_part(odometry, warnings), truth_rows, warnings)
     _check_steps(odometry)
     steps = bridged(Steps(odometry.values[:, 0], *(odometry.values[1:, column] for column in (1, 2, 3))))
-    readings, beacon_ids = _readings(recording, tables, steps, warnings)
+    readings, beacon_ids, range_step_m = _readings(recording, tables, steps, warnings)
     readings = _without_lone_levels(readings, beacon_ids, warnings)
     if unheard := [name for name in known.moving if name not in beacon_ids]:
         raise RadioDataError(
@@ -105,6 +107,7 @@ def _checked(recording: Recording, turns_heading: bool, known: Known, tag: str) 
         recording.name, recording.kind, steps, readings, beacon_ids, places_m, truth, first_pose, (),
         (ahead_m, left_m), known_map, tags, known.moving,
         tuple(name for name, one_m in zip(beacon_ids, z_m.tolist(), strict=True) if np.isfinite(one_m)),
+        range_step_m,
     )  # fmt: skip
     # A row with two readings gives the same warning of each.
     return replace(run, warnings=tuple(dict.fromkeys((*warnings, *suspicions(run)))))
@@ -208,18 +211,23 @@ def _check_steps(odometry: Table) -> None:
 
 def _readings(
     recording: Recording, tables: dict[str, Table], steps: Steps, warnings: list[str]
-) -> tuple[Readings, tuple[str, ...]]:
-    """Readings with range, bearing and strength of one beacon at one time in one row, and the names of the beacons."""
+) -> tuple[Readings, tuple[str, ...], float]:
+    """Readings with range, bearing and strength of one beacon at one time in one row.
+
+    Then the names of the beacons, and the step in which ranges come, m; 0: none.
+    """
     merged: dict[tuple[float, float, float], list[float]] = {}
     extra: list[tuple[float, float, float, list[float]]] = []
-    spans = []
+    spans, range_step_m = [], 0.0
     for place, kind in enumerate(READING_KINDS):
         if kind not in tables:
             continue
         table = measured(kind, tables[kind], warnings)
         spans += table.values[:, 0].tolist()
         table = table.where(within(table.values[:, 0], steps.times_s, kind, warnings))
-        table = frozen(kind, table, way_at(steps, table.values[:, 0]), recording.names, warnings)
+        step = step_of(table.values[:, 2]) if kind == "range" else 0.0
+        range_step_m = max(step, range_step_m)
+        table = frozen(kind, table, way_at(steps, table.values[:, 0]), recording.names, step, warnings)
         for t, who, value, by in table.values.tolist():
             row = merged.setdefault((t, who, by), [np.nan] * len(READING_KINDS))
             if np.isnan(row[place]):
@@ -235,7 +243,7 @@ def _readings(
     times_s, tag = np.array([(t, by) for t, _, by, _ in rows]).T.copy()
     range_m, bearing_rad, rssi_dbm = data.T.copy()
     readings = Readings(times_s, index.astype(np.int64), range_m, bearing_rad, rssi_dbm, tag.astype(np.int64))
-    return readings, tuple(recording.names[int(who)] for who in beacons)
+    return readings, tuple(recording.names[int(who)] for who in beacons), range_step_m
 
 
 def _without_lone_levels(readings: Readings, names: tuple[str, ...], warnings: list[str]) -> Readings:

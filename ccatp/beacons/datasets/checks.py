@@ -10,7 +10,7 @@ from ccatp.beacons.datasets.mounting import misplaced_radios, robust_fit
 from ccatp.beacons.datasets.tables import GAP_S, instant, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor, way_at
 from ccatp.beacons.estimation.evaluation import truth_at
-from ccatp.beacons.estimation.recording import Readings, RecordedRun, ReferencePath, Steps
+from ccatp.beacons.estimation.recording import BoolArray, Readings, RecordedRun, ReferencePath, Steps, first_of_each
 from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
 from ccatp.core import FloatArray
 
@@ -35,12 +35,11 @@ def readings_against(run: RecordedRun, truth: ReferencePath) -> Iterator[str]:
     """Warnings about readings while the truth is known, of beacons with known positions."""
     placed = np.array([run.beacon_truth_m.get(name, (np.nan, np.nan)) for name in run.beacon_ids]).reshape(-1, 2)
     r, t = run.readings, run.readings.times_s
-    inside = (t >= truth.times_s[0]) & (t <= truth.times_s[-1]) & np.isfinite(r.range_m)
-    inside &= np.isfinite(placed[r.beacon, 0])
+    pose = truth_at(truth, t)
+    inside = np.isfinite(pose[:, 0]) & np.isfinite(r.range_m) & np.isfinite(placed[r.beacon, 0])
     if inside.sum() < FEW:
         return
-    pose = np.column_stack([np.interp(t[inside], truth.times_s, column) for column in truth[1:]])
-    seen = r.where(inside)
+    pose, seen = pose[inside], r.where(inside)
     if not np.isfinite(truth.heading_rad).all():
         pose[:, 2] = np.nan
         seen = seen._replace(arm_m=None)  # without a heading the radios are about where the vehicle is
@@ -215,6 +214,7 @@ STANDS_M = 0.2
 LIKE = 0.3
 SPOT_M = 0.05  # radius of a turn on the spot,
 FEW_SPOTS = 0.2  # and their share of all turning, up to which positions tell how much the vehicle turns
+STEPS_APART = 4.0  # of the odometry, between which its turn is compared with the truth
 LEAST_TURNING_RAD2 = 0.1
 FASTEST_TURN_RAD_S = 10.0  # a faster turn means a wrong unit
 FASTEST_M_S = 50.0
@@ -306,7 +306,7 @@ def _odometry_against(truth: ReferencePath, steps: Steps) -> Iterator[str]:
     true_way = np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows]))
     half_turn = np.minimum(0.5 * np.abs(np.diff(amount_at(steps, steps.turn_rad, t))), 1.0)
     chord = np.abs(way) * np.sinc(half_turn / np.pi)  # of the arc
-    measured = np.diff(amount_at(steps, steps.guess_m2, t)) <= 0.0
+    measured = (np.diff(amount_at(steps, steps.guess_m2, t)) <= 0.0) & _without_gap(truth, rows)
     true_way, chord = true_way[measured], chord[measured]
     if chord.sum() > 0.0:
         scale = float(true_way.sum() / chord.sum())
@@ -323,6 +323,12 @@ def _standing(truth: ReferencePath, steps: Steps) -> Iterator[str]:
         yield f"odometry never moves ({way_m:.2g} m) while the truth gets {extent_m:.3g} m about: the right column?"
     elif extent_m < STANDS * way_m and inside.sum() >= FEW and extent_m < STANDS_M < way_m:
         yield f"the truth never moves ({extent_m:.2g} m) while the odometry travels {way_m:.3g} m: is it of this run?"
+
+
+def _without_gap(truth: ReferencePath, rows: npt.NDArray[np.int64]) -> BoolArray:
+    """Whether the truth has no gap between successive ones of its rows, shape (k - 1,)."""
+    before = np.searchsorted(long_pauses(truth.times_s, TRUTH_GAP_S), rows)
+    return np.asarray(np.diff(before) == 0)
 
 
 def _copied_odometry(truth: ReferencePath, steps: Steps) -> Iterator[str]:
@@ -357,16 +363,29 @@ def _turning_against(truth: ReferencePath, steps: Steps, rows: npt.NDArray[np.in
         if factor is not None:
             yield from _turns(factor, 1.0)
         return
+    # Within a step of the odometry its turn is not known: turns of a few steps are compared.
+    rows = rows[first_of_each(truth.times_s[rows], STEPS_APART * float(np.median(np.diff(steps.times_s))))]
     t = truth.times_s[rows]
-    x, y = np.diff(amount_at(steps, steps.turn_rad, t)), np.diff(truth.heading_rad[rows])
-    if float(x @ x) < LEAST_TURNING_RAD2 or y.std() == 0.0:
+    seen = _without_gap(truth, rows)
+    x, y = np.diff(amount_at(steps, steps.turn_rad, t))[seen], np.diff(truth.heading_rad[rows])[seen]
+    if x.size < 2 or float(x @ x) < LEAST_TURNING_RAD2 or y.std() == 0.0:
         return
-    yield from _turns(float(x @ y) / float(x @ x), float(np.corrcoef(x, y)[0, 1]))
+    # Noise of the odometry makes the slope of y on x too small, that of the truth the slope of x on y.
+    scale, likeness = float(x @ y) / float(x @ x), float(np.corrcoef(x, y)[0, 1])
+    if likeness < LIKE or _beyond(scale) == _beyond(float(y @ y) / float(x @ y)):
+        yield from _turns(scale, likeness)
+
+
+def _beyond(scale: float) -> int:
+    return int(abs(scale - 1.0) > TURN_WARNING and np.sign(scale - 1.0))
 
 
 def _turns(scale: float, likeness: float) -> Iterator[str]:
     if scale < 0.0 and abs(likeness) > LIKE:
-        yield f"odometry turns the other way than the truth ({scale:.3g} times): wheels exchanged, or a sign?"
+        yield (
+            f"odometry turns the other way than the truth ({scale:.3g} times): wheels exchanged, a sign, or a "
+            "truth whose y axis has the other direction?"
+        )
     elif likeness < LIKE:
         yield f"odometry turns have little to do with the truth (correlation {likeness:.2f})"
     elif abs(scale - 1.0) > TURN_WARNING:

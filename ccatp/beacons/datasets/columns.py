@@ -31,6 +31,7 @@ from ccatp.core import FloatArray
 
 LEAST_COLUMNS = 3  # of a table of readings
 QUATERNION = ("qx", "qy", "qz", "qw")
+PATH = ("x", "y", "heading", *QUATERNION)
 NOTHING = ("", "nan", "n/a", "#n/a", "na", "null", "none", "-", "--")  # cells without a value, in lower case
 TRUTH_NAME = re.compile(r"truth|gt|ground|reference|mocap|vicon|optitrack|qualisys|rtk|gnss|gps", re.IGNORECASE)
 
@@ -143,6 +144,11 @@ def read_columns(path: Path) -> Recording:
         for one in (table, *others.values())
         if one.unknown
     ]
+    if beside := [quantity for quantity in PATH if quantity in table.quantities]:
+        warnings.append(
+            f"{table.file.name}: a path beside the readings is not used: {listed(beside)}; give a truth in a table of "
+            "its own, with truth in its name"
+        )
     warnings += _exchanged(table)
     events = tables_of(file, _readings(table, numbers, tags))
     events |= dict([_motion(odometry[0])])
@@ -175,9 +181,11 @@ def read_survey(file: Path, text: str) -> tuple[list[str], FloatArray, FloatArra
 
 def lacking(text: str) -> str:
     """What the header of a text lacks to be one of readings; "" if it has no header, or that of another table."""
-    if len(columns := _header(text)) < LEAST_COLUMNS or _is_other_table(text):
-        return ""
+    columns = _header(text)
     found = {column.quantity for column in columns if column} | {"beacon" for one in columns if one and one.beacon}
+    beside_places = {"x", "y"} <= found and bool(found & {*READING_KINDS})
+    if len(columns) < LEAST_COLUMNS or (_is_other_table(text) and not beside_places):
+        return ""
     wanted = {"a time": {"time"}, "the name of a beacon": {"beacon"}, "a range, bearing or rssi": {*READING_KINDS}}
     missing = [what for what, names in wanted.items() if not found & names]
     cells = split_cells(content := _first_line(text[:20_000])[1], delimiter_of(content))

@@ -9,6 +9,7 @@ from scipy.optimize import fmin
 
 from ccatp.beacons.datasets.tables import instant
 from ccatp.beacons.datasets.trajectory import CONSTANT_RAD, STRAIGHT
+from ccatp.beacons.estimation.evaluation import truth_at
 from ccatp.beacons.estimation.recording import (
     BoolArray,
     Radio,
@@ -40,9 +41,11 @@ LEAST_GROUPS = 6
 LAGS_S = np.arange(-20.0, 20.01, 0.5)
 FINE_S = np.arange(-0.5, 0.501, 0.05)
 LEAST_LAG_S = 0.6  # smaller ones are the delay that the estimators calibrate: two sigmas of its widest prior
+LEAST_TRUTH_LAG_S = 0.15  # of the truth, which no estimator uses: nothing calibrates it; above the interval of most
 BETTER = 0.6  # of the misfit that remains with a lag, or in another unit
 MAJORITY = 0.65  # of the windows fit better
 LEAST_HEIGHT_M = 1.0
+TOLD = 0.3  # of the usual range: standard deviation of a beacon's place, up to which a window tells it
 FIRST_ARM_M, FINE_ARM_M, MOST_TRIES = 0.3, 0.01, 80  # of the search for the place of a radio on the vehicle
 LEAST_ARM_M, MOST_ARM_M = 0.15, 10.0  # above the error of the ranges, and as long as vehicles are
 CLEARLY = 0.9  # of the misfit that remains with another clock, or with another sign
@@ -228,16 +231,21 @@ class _Windows:
         return np.asarray(np.sqrt(fitted.squares / np.maximum(counts - 3, 1)))
 
     def heights_m2(self, times_s: FloatArray, path: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Square of the height of the beacon over the path that each window fits, and its sigma, m^2, shape (count,).
+        """Square of the height of the beacon over the path that a window fits, and its sigma, m^2, shape (k,).
 
-        With a height h the free term is |b|^2 + h^2.
+        With a height h the free term is |b|^2 + h^2. Windows that do not tell the place b are left out: there all of
+        the range would be height, as where the vehicle stands.
         """
         fitted = self._fitted(self._centred(self._seen.radios_at(_poses(times_s, path, self.times_s))))
         counts = np.bincount(self.group, minlength=self.count)
         slope = np.column_stack([-0.5 * fitted.terms[:, :2], np.ones(self.count)])
-        spread = np.linalg.solve(fitted.normal, slope[:, :, None])[:, :, 0]
-        variance = (slope * spread).sum(axis=1) * fitted.squares / np.maximum(counts - 3, 1)
-        return fitted.terms[:, 2] - 0.25 * (fitted.terms[:, :2] ** 2).sum(axis=1), np.sqrt(np.maximum(variance, 0.0))
+        spread = np.linalg.inv(fitted.normal) * (fitted.squares / np.maximum(counts - 3, 1))[:, None, None]
+        variance = np.einsum("na,nab,nb->n", slope, spread, slope)
+        of_place_m2 = 0.25 * np.trace(spread[:, :2, :2], axis1=1, axis2=2)
+        usual_m = np.bincount(self.group, self.range_m, self.count) / counts
+        told = of_place_m2 < (TOLD * usual_m) ** 2
+        squares_m2 = fitted.terms[:, 2] - 0.25 * (fitted.terms[:, :2] ** 2).sum(axis=1)
+        return squares_m2[told], np.sqrt(np.maximum(variance, 0.0))[told]
 
     def _centred(self, at: FloatArray) -> FloatArray:
         counts = np.bincount(self.group, minlength=self.count)
@@ -301,7 +309,8 @@ def _readings_clock(run: RecordedRun, path: FloatArray) -> Iterator[str]:
 
 def _above(squares_m2: FloatArray, sigmas_m2: FloatArray, kind: str) -> Iterator[str]:
     if (
-        np.mean(squares_m2 > 2.0 * sigmas_m2) > MAJORITY
+        squares_m2.size >= LEAST_GROUPS
+        and np.mean(squares_m2 > 2.0 * sigmas_m2) > MAJORITY
         and (usual_m2 := float(np.median(squares_m2))) > LEAST_HEIGHT_M**2
     ):
         yield (
@@ -361,7 +370,7 @@ def _shifted(lag_s: float) -> str:
     return f"if taken {abs(lag_s):.2g} s {'later' if lag_s > 0.0 else 'earlier'}"
 
 
-def _lags(misfits: Callable[[float], FloatArray], parts: list[BoolArray]) -> list[float]:
+def _lags(misfits: Callable[[float], FloatArray], parts: list[BoolArray], least_s: float = LEAST_LAG_S) -> list[float]:
     """For each part of the windows the lag at which most of them fit much better, s; 0.0: there is none."""
     now, later = misfits(0.0), [misfits(float(lag_s)) for lag_s in LAGS_S]
     found = []
@@ -372,7 +381,7 @@ def _lags(misfits: Callable[[float], FloatArray], parts: list[BoolArray]) -> lis
         coarse = LAGS_S[int(np.argmin([_typical(one[part], now[part]) for one in later]))]
         near = [(float(lag_s), misfits(float(lag_s))[part]) for lag_s in coarse + FINE_S]
         best_s, best = min(near, key=lambda one: _typical(one[1], now[part]))
-        is_lag = abs(best_s) >= LEAST_LAG_S and _is_better(now[part], best)
+        is_lag = abs(best_s) >= least_s and _is_better(now[part], best)
         found.append(best_s if is_lag else 0.0)
     return found
 
@@ -394,9 +403,12 @@ def _truth_clock(truth: ReferencePath, times_s: FloatArray, path: FloatArray) ->
     t = np.linspace(start_s, start_s + pieces * PIECE_S, pieces * PIECE_POINTS)
 
     def cut(of_s: FloatArray, x: FloatArray, y: FloatArray, at_s: FloatArray) -> npt.NDArray[np.complex128]:
-        points = (np.interp(at_s, of_s, x) + 1j * np.interp(at_s, of_s, y)).reshape(pieces, PIECE_POINTS)
+        points = (np.interp(at_s, of_s, x) + 1j * np.interp(at_s, of_s, y)).reshape(pieces, PIECE_POINTS)[there]
         return np.asarray(points - points.mean(axis=1, keepdims=True))
 
+    there = np.isfinite(truth_at(truth, t)[:, 0]).reshape(pieces, PIECE_POINTS).all(axis=1)
+    if there.sum() < LEAST_PIECES:
+        return
     true = cut(*truth[:3], t)
     if float(np.median(np.abs(true).max(axis=1))) < LEAST_SHAPE_M:
         return
@@ -407,6 +419,6 @@ def _truth_clock(truth: ReferencePath, times_s: FloatArray, path: FloatArray) ->
         turned /= np.maximum(np.abs(turned), 1e-12)
         return np.asarray(np.sqrt((np.abs(own * turned[:, None] - true) ** 2).mean(axis=1)))
 
-    (lag_s,) = _lags(misfits, [np.ones(pieces, dtype=bool)])
+    (lag_s,) = _lags(misfits, [there[there]], LEAST_TRUTH_LAG_S)
     if lag_s:
         yield f"the truth fits the odometry best {_shifted(lag_s)}: their clocks differ, and the errors contain that"

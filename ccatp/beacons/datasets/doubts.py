@@ -11,6 +11,7 @@ from ccatp.beacons.cricket.map_fit import map_rms_m
 from ccatp.beacons.datasets.checks import STRANGER_M
 from ccatp.beacons.datasets.mounting import robust_fit
 from ccatp.beacons.datasets.tables import instant, listed
+from ccatp.beacons.estimation.predictions import place_by_ranges
 from ccatp.beacons.estimation.range_noise import correlations
 from ccatp.beacons.estimation.recording import EstimatedPath, KnownMap, RecordedRun
 from ccatp.beacons.estimation.track_review import range_residuals
@@ -150,26 +151,72 @@ def map_against_survey(known: KnownMap, surveyed_m: Mapping[str, tuple[float, fl
 
 
 STRAY = 5.0  # times the usual miss of the beacons
+PARTS = 12  # of the readings of a beacon, between which it may have been moved
+MOVED_M = 0.5  # distance of two places of a beacon that was moved, at least,
+HALVED = 0.5  # and the share of the misfit that they leave, at most
+OUTLYING = 3.0  # medians, or ``MOVED_M``, at which misses are cut off
 
 
 def stray_beacons(run: RecordedRun, track: EstimatedPath) -> list[str]:
-    """A warning for each beacon of which the ranges miss its place on the map far more than those of the others."""
-    misses_m = {}
+    """A warning for each beacon that was moved, and for those whose ranges miss their place far more than others'.
+
+    Of one that was placed again on the way another warning says that it was moved.
+    """
+    misses_m, moved = {}, []
     for k, name in enumerate(run.beacon_ids):
         seen = run.readings.where((run.readings.beacon == k) & np.isfinite(run.readings.range_m))
         if name in track.beacons and len(seen.times_s) >= FEWEST:
             at = seen.radios_at(track.poses_at(seen.times_s))
             off_m = seen.range_m - np.hypot(*(np.array(track.beacons[name][:2]) - at).T)
             misses_m[name] = float(np.median(np.abs(off_m - np.median(off_m))))
+            calibrated_m = track.calibrated(seen, run.beacon_ids).range_m
+            if name not in track.tracks and (
+                line := _moved_once(name, seen.times_s, calibrated_m, at, np.array(track.beacons[name][:2]))
+            ):
+                moved.append((name, line))
     if len(misses_m) < LEAST_BEACONS:
         return []
+    if 2 * len(moved) > len(misses_m):  # the path has a bend that is none, not the beacons
+        moved = []
+    for name, _ in moved:
+        del misses_m[name]
     usual_m = float(np.median(list(misses_m.values())))
-    return [
+    return [line for _, line in moved] + [
         f"ranges of beacon {name} miss its place by {miss_m:.2g} m (half of them), those of the others by "
         f"{usual_m:.2g} m: does it move?"
         for name, miss_m in misses_m.items()
         if miss_m > max(STRANGER_M, STRAY * usual_m)
     ]
+
+
+def _moved_once(name: str, times_s: FloatArray, range_m: FloatArray, at: FloatArray, place: FloatArray) -> str:
+    """A warning if the ranges (m,) from places (m, 2) fit two places of the beacon, one after the other, far better."""
+    single_m = _misses(range_m, at, place_by_ranges(range_m, at, place))
+    most_m = max(MOVED_M, OUTLYING * float(np.median(single_m)))
+    best: tuple[float, int, FloatArray, FloatArray] | None = None
+    for cut in np.unique(np.linspace(0, len(times_s), PARTS + 1).astype(int)[1:-1]).tolist():
+        if min(cut, len(times_s) - cut) < FEWEST:
+            continue
+        parts = [(range_m[:cut], at[:cut]), (range_m[cut:], at[cut:])]
+        places = [place_by_ranges(*part, place) for part in parts]
+        misses_m = np.concatenate([_misses(*part, one) for part, one in zip(parts, places, strict=True)])
+        miss_m = float(np.minimum(misses_m, most_m).mean())
+        if best is None or miss_m < best[0]:
+            best = miss_m, cut, places[0], places[1]
+    if best is None or best[0] > HALVED * float(np.minimum(single_m, most_m).mean()):
+        return ""
+    miss_m, cut, first, second = best
+    if float(np.hypot(*(second - first))) < max(MOVED_M, STRAY * miss_m):
+        return ""
+    return (
+        f"ranges of beacon {name} fit the place ({first[0]:.2f}, {first[1]:.2f}) until about {instant(times_s[cut])} "
+        f"and ({second[0]:.2f}, {second[1]:.2f}) afterwards: was it moved? The map has one place of it; give its later "
+        "readings another name"
+    )
+
+
+def _misses(range_m: FloatArray, at: FloatArray, place: FloatArray) -> FloatArray:
+    return np.asarray(np.abs(range_m - np.hypot(*(place - at).T)))
 
 
 TOGETHER_S = 5.0  # readings within this time are looked at together,

@@ -17,9 +17,10 @@ HEADERS = {
     "fraction": ("nanosec", "nsec", "nsecs", "nanoseconds", "stamp_nanosec", "stamp_nsec", "stamp_nsecs"),
     "beacon": (
         "beacon", "anchor", "beacon_id", "anchor_id", "beaconid", "anchorid", "anchor_name", "responder",
-        "responder_id", "node", "node_id", "mote", "landmark", "landmark_id", "address", "id",
+        "responder_id", "to_id", "dest_id", "destination_id", "node", "node_id", "mote", "landmark",
+        "landmark_id", "address", "id",
     ),
-    "tag": ("tag", "tag_id", "tagid", "tag_name", "initiator", "initiator_id", "src", "source", "source_id"),
+    "tag": ("tag", "tag_id", "tagid", "tag_name", "initiator", "initiator_id", "src", "source", "source_id", "from_id"),
     "range": ("range", "distance", "dist", "r"),
     "bearing": ("bearing", "aoa", "azimuth"),
     "rssi": ("rssi", "level", "rx_power", "signal_strength"),

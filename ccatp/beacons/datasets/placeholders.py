@@ -21,6 +21,11 @@ OFTEN = 3  # equal values that stand apart and are no known placeholder
 OFTEN_AT_END, TIMES_OTHERS = 6, 3.0  # equal end values that do not stand apart, and how much more often than any other
 FROZEN = 12  # equal readings of one beacon in a row while the vehicle moves
 FROZEN_M = 1.0
+FROZEN_STEPS = 10.0  # and so many steps in which the values come: across its direction a vehicle hardly changes a range
+
+READINGS_A_VALUE = 5  # that readings in steps repeat at least, in the mean
+LEAST_VALUES = 50  # readings from which their steps are known
+OFF_STEP = 0.02  # of a step: written with few digits
 
 FASTER = 10.0  # times the usual rate of the run
 USUAL = 90.0  # percentile of the rates in motion
@@ -90,11 +95,27 @@ def _is_placeholder(kind: str, value: float, beacons: FloatArray, values: FloatA
     return count > TIMES_OTHERS * float(np.unique(others, return_counts=True)[1].max())
 
 
-def frozen(kind: str, table: Table, way_m: FloatArray, names: tuple[str, ...], warnings: list[str]) -> Table:
+def step_of(values: FloatArray) -> float:
+    """The step in which values (n,) come, as of ranges in whole metres; 0: they come in none, or there are too few."""
+    if values.size < LEAST_VALUES:
+        return 0.0
+    unique = np.unique(values)
+    if not 1 < unique.size <= values.size / READINGS_A_VALUE:
+        return 0.0
+    gaps = np.diff(unique)
+    steps = np.round(gaps / gaps.min())
+    step = float(np.median(gaps / steps))
+    return step if bool((np.abs(gaps / step - steps) < OFF_STEP).all()) else 0.0
+
+
+def frozen(
+    kind: str, table: Table, way_m: FloatArray, names: tuple[str, ...], step: float, warnings: list[str]
+) -> Table:
     """The readings without those that repeat the one before again and again while the vehicle moves.
 
-    ``way_m``: travelled until each reading, shape (n,).
+    ``way_m``: travelled until each reading, shape (n,). ``step``: in which ranges come, m; 0 for other kinds.
     """
+    least_m = FROZEN_M + FROZEN_STEPS * step
     stale = np.zeros(len(table.values), dtype=bool)
     pairs, pair = np.unique(table.values[:, [1, *range(3, table.values.shape[1])]], axis=0, return_inverse=True)
     for k, (beacon, *_) in enumerate(pairs.tolist()):  # of beacon and radio
@@ -102,7 +123,7 @@ def frozen(kind: str, table: Table, way_m: FloatArray, names: tuple[str, ...], w
         edges = np.flatnonzero(np.diff(table.values[rows, 2]) != 0.0) + 1
         for first, stop in zip([0, *edges.tolist()], [*edges.tolist(), rows.size], strict=True):
             run = rows[first:stop]
-            if run.size >= FROZEN and way_m[run[-1]] - way_m[run[0]] > FROZEN_M:
+            if run.size >= FROZEN and way_m[run[-1]] - way_m[run[0]] > least_m:
                 stale[run[1:]] = True
                 begin_s, value = table.values[run[0], [0, 2]].tolist()
                 warnings.append(

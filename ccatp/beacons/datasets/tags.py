@@ -59,6 +59,54 @@ def radios_of(recording: Recording, wanted: str, warnings: list[str]) -> Radios:
     return Radios(tables, places_m.get(used[0], antenna_m), {})
 
 
+def from_the_vehicle(recording: Recording, warnings: list[str]) -> Recording:
+    """The recording with the vehicle's radio as the tag of each reading, and the other one as the beacon.
+
+    Ranges of two ways name their radios in either order, and some are between two beacons. So if names of tags are
+    those of beacons, too, the vehicle's radios are those with a place on it, or else the one that is part of most
+    readings and was not surveyed.
+    """
+    readings = {kind: table for kind, table in recording.tables.items() if kind in READING_KINDS}
+    ends = {
+        kind: [
+            (tag, recording.names[int(k)])
+            for tag, k in zip(_names(table, recording.tags), table.values[:, 1].tolist(), strict=True)
+        ]
+        for kind, table in readings.items()
+    }
+    pairs = [pair for each in ends.values() for pair in each]
+    heard = {beacon for _, beacon in pairs}
+    # No radio ranges itself: then tags and beacons are counted each from the first on.
+    if not {tag for tag, _ in pairs} & heard or any(tag == beacon for tag, beacon in pairs):
+        return recording
+    surveyed = recording.tables.get("beacon")
+    stand = set() if surveyed is None else {recording.names[int(k)] for k in surveyed.values[:, 0].tolist()}
+    counts = Counter(name for pair in pairs for name in pair if name and name not in stand)
+    own = {*_mounted(recording)} or {name for name, _ in counts.most_common(1)}
+    if not {tag for tag, _ in pairs if tag} <= own | heard | stand:
+        return recording
+    names, tags = (tuple(dict.fromkeys((*first, *recording.names, *recording.tags))) for first in ((), recording.tags))
+    tables, turned, left_out = dict(recording.tables), 0, 0
+    for kind, table in readings.items():
+        rows, kept = table.values.copy(), np.ones(len(table.values), dtype=bool)
+        for row, (tag, beacon) in enumerate(ends[kind]):
+            if beacon in own and tag not in own and tag and kind != "bearing":  # that is a bearing from the beacon
+                rows[row, 1], rows[row, TAG], turned = names.index(tag), tags.index(beacon), turned + 1
+            elif beacon in own or (tag and tag not in own):
+                kept[row], left_out = False, left_out + 1
+            else:
+                rows[row, 1] = names.index(beacon)
+        tables[kind] = table._replace(values=rows).where(kept)
+    if surveyed is not None:
+        index = [float(names.index(recording.names[int(k)])) for k in surveyed.values[:, 0].tolist()]
+        tables["beacon"] = surveyed._replace(values=np.column_stack([index, surveyed.values[:, 1:]]))
+    warnings.append(
+        f"tags and beacons have the same names: {listed(sorted(own))} is taken to be on the vehicle; {turned} readings "
+        f"have it as the beacon and were turned round, {left_out} without it are not used"
+    )
+    return recording._replace(tables=tables, names=names, tags=tags)
+
+
 def _listed(counts: Mapping[str, int]) -> str:
     return listed([f"{name or 'without a name'} ({count})" for name, count in counts.items()])
 
@@ -88,6 +136,11 @@ def _places(recording: Recording) -> dict[str, Place]:
         if np.isfinite(place[:2]).all():
             found[name] = place_m
     return found
+
+
+def _mounted(recording: Recording) -> list[str]:
+    table = recording.tables.get("tag")
+    return [] if table is None else [recording.tags[int(tag)] for tag in table.values[:, 0].tolist()]
 
 
 def _antenna(mounted: Table | None) -> Place:

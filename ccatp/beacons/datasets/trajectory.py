@@ -4,6 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.beacons.datasets.tables import Table, long_pauses
+from ccatp.beacons.estimation.evaluation import truth_at
 from ccatp.beacons.estimation.recording import ReferencePath, Steps, antenna_path, dead_reckoned, running_total
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import wrapped
@@ -235,9 +236,12 @@ def turning_factor(truth: ReferencePath, steps: Steps) -> float | None:
     t = np.linspace(start_s, start_s + pieces * PIECE_S, pieces * PIECE_POINTS)
 
     def cut(times_s: FloatArray, x_m: FloatArray, y_m: FloatArray) -> npt.NDArray[np.complex128]:
-        points = (np.interp(t, times_s, x_m) + 1j * np.interp(t, times_s, y_m)).reshape(pieces, PIECE_POINTS)
+        points = (np.interp(t, times_s, x_m) + 1j * np.interp(t, times_s, y_m)).reshape(pieces, PIECE_POINTS)[there]
         return np.asarray(points - points.mean(axis=1, keepdims=True))
 
+    there = np.isfinite(truth_at(truth, t)[:, 0]).reshape(pieces, PIECE_POINTS).all(axis=1)
+    if there.sum() < LEAST_PIECES:
+        return None
     true = cut(*truth[:3])
 
     def misfit(factor: float) -> float:

@@ -34,6 +34,7 @@ from ccatp.core import FloatArray
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported
 BOTH_SCALES = ("distance_scale", "range_scale")
+SCALES, NO_SCALE = (*BOTH_SCALES, "turn_scale"), 0.3  # larger ones are no calibration of an instrument
 TOGETHER = 0.5  # of the larger scale is in the other one, too
 UNCHANGED = 0.999  # share of the prior's standard deviation above which a value counts as not determined by readings
 
@@ -55,7 +56,14 @@ def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, fl
     for name, (value, _) in calibration.items():
         key = name if name in priors else HEIGHT_M2  # of one beacon
         sigma = priors[key]
-        if abs(value) > FAR * sigma and not (together and name in BOTH_SCALES):
+        if abs(value) <= FAR * sigma or (together and name in BOTH_SCALES):
+            continue
+        if name in SCALES and abs(value) > NO_SCALE:
+            yield (
+                f"{name} comes out as {value:+.3g}, which no calibration is: look for a wrong unit, clock or sign, or "
+                f"a vehicle or beacons that were moved; do not widen {kind}.priors.{key} for it"
+            )
+        else:
             yield (
                 f"{name} comes out as {value:+.3g}, {abs(value) / sigma:.1f} standard deviations of its prior: "
                 f"if that can be, widen {kind}.priors.{key} (now {sigma:g})"

@@ -85,22 +85,32 @@ def _errors(r: Readings, at: FloatArray, places: FloatArray) -> FloatArray:
 
 
 def _fitted(r: Readings, at: FloatArray, places: FloatArray) -> FloatArray:
-    """Places of the beacons that fit ranges from given places (m, 2) best, near those given: both paths get their map.
+    """Places of the beacons that fit ranges from given places (m, 2) best, near those given.
 
-    Gauss-Newton with the weights of Cauchy's distribution, as wide as the errors.
+    So both paths get their own map.
     """
     places = places.copy()
     for k in np.unique(r.beacon).tolist():
         rows = r.beacon == k
-        for _ in range(FITS):
-            way = places[k] - at[rows]
-            distance_m = np.maximum(np.hypot(*way.T), _NEAR_M)
-            e = r.range_m[rows] - distance_m
-            weights = 1.0 / (1.0 + (e / max(float(np.median(np.abs(e))), _NEAR_M)) ** 2)
-            J = way / distance_m[:, None]
-            square = J.T @ (weights[:, None] * J)
-            places[k] += np.linalg.solve(square + np.trace(square) * _FLAT * np.eye(2), J.T @ (weights * e))
+        places[k] = place_by_ranges(r.range_m[rows], at[rows], places[k])
     return places
+
+
+def place_by_ranges(range_m: FloatArray, at: FloatArray, start: FloatArray) -> FloatArray:
+    """The place (2,) that fits ranges (m,) from places (m, 2) best, near ``start``.
+
+    Gauss-Newton with the weights of Cauchy's distribution, as wide as the errors.
+    """
+    place = start.copy()
+    for _ in range(FITS):
+        way = place - at
+        distance_m = np.maximum(np.hypot(*way.T), _NEAR_M)
+        e = range_m - distance_m
+        weights = 1.0 / (1.0 + (e / max(float(np.median(np.abs(e))), _NEAR_M)) ** 2)
+        J = way / distance_m[:, None]
+        square = J.T @ (weights[:, None] * J)
+        place = place + np.linalg.solve(square + np.trace(square) * _FLAT * np.eye(2), J.T @ (weights * e))
+    return np.asarray(place)
 
 
 def prediction_doubts(found: Predictions | None) -> Iterator[str]:

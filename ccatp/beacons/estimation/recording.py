@@ -141,6 +141,7 @@ class RecordedRun:
 
     moving: tuple[str, ...] = ()  # of ``beacon_ids``: those that move
     levelled: tuple[str, ...] = ()  # those of known height: their ranges are in the plane of the antenna
+    range_step_m: float = 0.0  # in which ranges come; 0: in none
 
     @property
     def raised(self) -> BoolArray:

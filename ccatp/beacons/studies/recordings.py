@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
+from math import hypot, sqrt
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.beacons.config.load import load_radio_config
-from ccatp.beacons.config.models import RecordingsConfig
+from ccatp.beacons.config.models import RecordingConfig, RecordingsConfig
 from ccatp.beacons.cricket.measured_map import map_measured
 from ccatp.beacons.datasets.doubts import (
     known_place_doubts,
@@ -52,13 +53,26 @@ class EstimateError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
+ROUNDING_COUNTS = 0.25  # of the configured standard deviation of a range, above which that of its rounding is added
+
+
+def settings_of(run: RecordedRun, assumed: RecordingsConfig) -> RecordingConfig:
+    """The settings of the run's format. If its ranges come in steps, step^2 / 12 is added to their variance."""
+    cfg: RecordingConfig = getattr(assumed, run.kind)
+    rounding_m = run.range_step_m / sqrt(12.0)
+    if rounding_m <= ROUNDING_COUNTS * cfg.radio.range_sigma_m:
+        return cfg
+    radio = cfg.radio.model_copy(update={"range_sigma_m": hypot(cfg.radio.range_sigma_m, rounding_m)})
+    return cfg.model_copy(update={"radio": radio})
+
+
 def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> EstimatedPath:
     """Estimate a run by one of ``FILTERS``.
 
     Raises EstimateError: the estimate is not finite, the data do not determine it, or the estimator has no model of
     beacons that move.
     """
-    cfg = getattr(assumed, run.kind)
+    cfg = settings_of(run, assumed)
     if run.moving and filter_name == "smoother":
         raise EstimateError(
             f"{run.name}: the smoother has no model of beacons that move ({', '.join(run.moving)}); use ekf-slam or "
@@ -81,6 +95,12 @@ def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> E
         surveyed += map_doubts(track, run.known_map) or known_place_doubts(run, track, cfg.radio.camera_field_rad)
         surveyed += map_against_survey(run.known_map, run.beacon_truth_m)
     surveyed += radio_doubts(run, track)
+    own_m, used_m = getattr(assumed, run.kind).radio.range_sigma_m, cfg.radio.range_sigma_m
+    if used_m > own_m:
+        surveyed.append(
+            f"ranges come in steps of {run.range_step_m:.3g} m: their noise is taken as {used_m:.2g} m, not "
+            f"{run.kind}.radio.range_sigma_m = {own_m:g}"
+        )
     doubts = prediction_doubts(predicted(run, track, cfg.radio.camera_field_rad))
     return track._replace(
         warnings=(*track.warnings, *stray_beacons(run, track), *sudden_disagreement(track), *surveyed, *doubts)
@@ -105,7 +125,7 @@ def compared(
     for name in FILTERS[:-1] if run.moving else FILTERS:  # the smoother has no model of beacons that move
         begin_s = perf_counter()
         tracks.append((name, estimate(run, assumed, name), perf_counter() - begin_s))
-    peers = run_gtsam(run, getattr(assumed, run.kind), perf_counter, assumed.run.peer_limit_s, progress)
+    peers = run_gtsam(run, settings_of(run, assumed), perf_counter, assumed.run.peer_limit_s, progress)
     names = list(PEERS)
     try:
         while names:
@@ -173,7 +193,7 @@ def _on_robot(job: Job, robot: int | None, share: float) -> dict[str, float | No
     if estimator in FILTERS:
         track = estimate(run, cfg, estimator)
     else:
-        tracks = run_gtsam(run, getattr(cfg, run.kind), perf_counter, cfg.run.peer_limit_s)
+        tracks = run_gtsam(run, settings_of(run, cfg), perf_counter, cfg.run.peer_limit_s)
         track = peer_track(tracks, estimator)
     run_s = perf_counter() - begin_s
     data = result_data(run, estimator, track, judge(track, run))

@@ -12,7 +12,7 @@ from ccatp.beacons.datasets.ordering import clock_sets
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.estimation.recording import RecordedRun, dead_reckoned
-from ccatp.beacons.studies.recordings import estimate
+from ccatp.beacons.studies.recordings import estimate, settings_of
 from ccatp.core import FloatArray
 from tests.unit.beacons.datasets.sets import BEACONS, World, csv_lines, world, write_lines
 
@@ -170,6 +170,18 @@ def test_a_frozen_beacon_is_used_once(tmp_path: Path) -> None:
     run, said = read(tmp_path, with_value("range", 3, "3.21", lambda k: k % 4 == 1 and 100 <= k < 200))
     assert "range of beacon 7 repeats 3.21 25 times from" in said
     assert np.sum(run.readings.range_m == 3.21) == 1
+
+
+def test_ranges_in_whole_metres_are_no_frozen_ones_and_their_rounding_is_noise(tmp_path: Path) -> None:
+    run, said = read(tmp_path, each("range", lambda k, cells: [*cells[:3], f"{float(cells[3]):.0f}"]))
+    assert run.range_step_m == pytest.approx(1.0)
+    assert "repeats" not in said
+    cfg = load_recordings_config()
+    assert settings_of(run, cfg).radio.range_sigma_m == pytest.approx(np.hypot(0.1, 1.0 / np.sqrt(12.0)))
+    track = estimate(run, cfg, "fixed-lag")
+    assert any("ranges come in steps of 1 m: their noise is taken as 0.31 m, not" in line for line in track.warnings)
+    fine, _ = read(tmp_path, lambda lines: lines)
+    assert settings_of(fine, cfg) is cfg.csv
 
 
 def test_a_step_far_beyond_the_run_is_a_gap(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from ccatp.beacons.estimation.recording import (
     ReferencePath,
     Steps,
     antenna_path,
+    dead_reckoned,
 )
 from tests.unit.beacons.datasets.sets import (
     BEACONS,
@@ -83,7 +84,7 @@ WRONG: list[tuple[RecordedRun, str, str]] = [
     (recorded(W), "odometry turns equal the truth", "surveyed"),
     (noisy(scale=0.8), "odometry distance: true ways are 1.25 times it", "degrees"),
     (noisy(scale=1000.0), "true ways are 0.001 times it: are they in millimetres?", "degrees"),
-    (noisy(turn_scale=0.8), "true turns are 1.24 times them (track of the wheels?)", "degrees"),
+    (noisy(turn_scale=0.8), "true turns are 1.25 times them (track of the wheels?)", "degrees"),
     (noisy(turn_scale=180.0 / np.pi), "are the turns in degrees?", "surveyed"),
     (noisy(turn_scale=-1.0), "odometry turns the other way than the truth", "degrees"),
     (with_steps(turn_rad=SHUFFLED), "odometry turns have little to do with the truth", "degrees"),
@@ -133,6 +134,40 @@ def test_a_sound_run_raises_no_suspicion() -> None:
     assert suspicions(SOUND) == []
     assert "exchanged" not in " | ".join(suspicions(NEIGHBOURS))
     assert "exchanged" not in " | ".join(suspicions(surveyed(_8=(X + 0.3, Y))))
+
+
+def test_noise_of_the_odometry_is_no_scale_of_its_turns() -> None:
+    """The slope of the truth on noisy turns is too small: turns of a fast vehicle change little between two chords."""
+    noise = np.random.default_rng(5).normal(0.0, 0.012, SOUND.steps.turn_rad.size)
+    assert not any("true turns" in line for line in suspicions(with_steps(turn_rad=SOUND.steps.turn_rad + noise)))
+
+
+def test_checks_leave_out_the_gap_of_a_truth() -> None:
+    """As of a motion capture that sees the beginning and the end of a run."""
+    seen = (W.times_s < 30.0) | (W.times_s > 90.0)
+    (line,) = suspicions(replace(SOUND, truth=ReferencePath(*(column[seen] for column in COURSE))))
+    assert line.startswith("truth: 1 gap, the longest of 60.")
+    unturned = ReferencePath(*(column[seen] for column in COURSE[:3]), np.full(seen.sum(), np.nan))
+    assert not any("fits the odometry" in line for line in suspicions(replace(SOUND, truth=unturned)))
+
+
+@pytest.mark.parametrize("late_s", [0.3, -0.2])
+def test_a_truth_that_is_a_little_late_is_named(late_s: float) -> None:
+    reported = " | ".join(suspicions(with_truth(times_s=COURSE.times_s + late_s)))
+    assert f"if taken {abs(late_s)} s {'earlier' if late_s > 0 else 'later'}: their clocks differ" in reported
+
+
+def test_a_vehicle_that_mostly_stands_has_no_beacons_above_it() -> None:
+    """In its place all of the range would be height."""
+    slow = 0.1 * (W.times_s[:-1] < 20.0)
+    steps = Steps(W.times_s, slow * SOUND.steps.distance_m, slow * SOUND.steps.turn_rad, np.zeros(slow.size))
+    path = dead_reckoned(steps, (3.0, 1.0, 0.4))
+    at = np.array([np.interp(READ.times_s, W.times_s, column) for column in path[:, :2].T])
+    noise = np.random.default_rng(2).normal(0.0, 0.02, READ.times_s.size)
+    ranges = np.hypot(*(np.array(list(BEACONS.values()))[READ.beacon].T - at)) + noise
+    nothing = np.full(ranges.size, np.nan)
+    run = replace(SOUND, steps=steps, truth=None, readings=READ._replace(range_m=ranges, bearing_rad=nothing))
+    assert not any("above or below" in line for line in suspicions(run))
 
 
 @pytest.mark.parametrize(("run", "what", "unsaid"), WRONG, ids=[what for _, what, _ in WRONG])

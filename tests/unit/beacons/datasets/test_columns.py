@@ -340,6 +340,60 @@ def test_tags_in_a_csv_of_events(tmp_path: Path) -> None:
         read_run(write_lines(tmp_path / "run.csv", [*lines, "tag,,0.3,0.1"]), None, None)
 
 
+@pytest.mark.parametrize("is_surveyed", [True, False])
+def test_ranges_of_both_ways_and_between_beacons(tmp_path: Path, is_surveyed: bool) -> None:
+    """As of two-way ranging: either radio may begin, and the beacons range each other."""
+    long_form(tmp_path)
+    if not is_surveyed:
+        (tmp_path / "anchors.csv").unlink()
+    rows: list[tuple[object, ...]] = [
+        (t, name, "10", r) if k % 3 == 0 else (t, "10", name, r) for k, (t, name, r) in enumerate(RANGES)
+    ]
+    rows += [(t + 0.01, "6", "8", 3.3) for t, *_ in RANGES[::2]]
+    run = read_run(write_lines(tmp_path / "uwb.csv", lines_of("time,from_id,to_id,range", rows)), None, None)
+    assert set(run.beacon_ids) == set(NAMES)
+    assert run.readings.range_m.tolist() == [r for *_, r in RANGES]
+    assert [run.beacon_ids[k] for k in run.readings.beacon.tolist()] == [name for _, name, _ in RANGES]
+    assert run.beacon_truth_m == (BEACONS if is_surveyed else {})
+    turned, left_out = len(RANGES[::3]), len(RANGES[::2])
+    what = (
+        f"10 is taken to be on the vehicle; {turned} readings have it as the beacon and were turned round, {left_out}"
+    )
+    assert what in " | ".join(run.warnings)
+
+
+def test_two_radios_with_places_and_ranges_of_both_ways(tmp_path: Path) -> None:
+    long_form(tmp_path)
+    write_lines(tmp_path / "tags.csv", TAGS)
+    rows: list[tuple[object, ...]] = [
+        (t, name, "12"[k % 2], r) if k % 3 == 0 else (t, "12"[k % 2], name, r) for k, (t, name, r) in enumerate(RANGES)
+    ]
+    rows.append((RANGES[5][0], "1", "2", 0.8))
+    run = read_run(write_lines(tmp_path / "uwb.csv", lines_of("time,from_id,to_id,range", rows)), None, None)
+    assert run.tags == (Radio("1", 0.4, 0.1), Radio("2", -0.4, -0.1))
+    assert len(run.readings.times_s) == len(RANGES)
+    assert run.readings.tag is not None
+    assert run.readings.tag.tolist() == [k % 2 for k in range(len(RANGES))]
+
+
+def test_tags_and_beacons_that_are_numbered_alike_stay_what_they_are(tmp_path: Path) -> None:
+    long_form(tmp_path)
+    rows: list[tuple[object, ...]] = [(t, "6", name, r) for t, name, r in RANGES]
+    run = read_run(write_lines(tmp_path / "uwb.csv", lines_of("time,tag_id,anchor,range", rows)), None, None)
+    assert [run.beacon_ids[k] for k in run.readings.beacon.tolist()] == [name for _, name, _ in RANGES]
+    assert run.warnings == read_run(long_form(tmp_path), None, None).warnings
+
+
+def test_a_path_beside_the_readings_is_named(tmp_path: Path) -> None:
+    long_form(tmp_path)
+    rows: list[tuple[object, ...]] = [(*row, 1.0, 2.0) for row in RANGES]
+    run = read_run(write_lines(tmp_path / "uwb.csv", lines_of("time,anchor,range,x,y", rows)), None, None)
+    assert any(line.startswith("uwb.csv: a path beside the readings is not used: x, y") for line in run.warnings)
+    write_lines(tmp_path / "uwb.csv", lines_of("time,peer,range,x,y", rows))
+    with pytest.raises(RadioDataError, match=r"\(time, peer, range, x, y\) has no column with the name of a beacon"):
+        read_run(tmp_path, None, None)
+
+
 def test_tags_and_beacons_that_are_exchanged_are_named(tmp_path: Path) -> None:
     long_form(tmp_path)
     rows: list[tuple[object, ...]] = [(t, name, "vehicle", r) for t, name, r in RANGES]

@@ -1,5 +1,6 @@
 """Warnings about an estimate: surveys and maps that it contradicts, and readings that are off all at once."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,14 @@ from ccatp.beacons.datasets.doubts import (
     survey_doubts,
 )
 from ccatp.beacons.estimation.causal import filter_run
-from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, KnownMap, ReadingInnovation, RecordedRun
+from ccatp.beacons.estimation.recording import (
+    BeaconFix,
+    BeaconTrack,
+    EstimatedPath,
+    KnownMap,
+    ReadingInnovation,
+    RecordedRun,
+)
 from tests.unit.beacons.datasets.sets import BEACONS, recorded, world
 
 W = world(seconds=120.0)
@@ -145,6 +153,28 @@ def test_beacons_that_are_often_off_are_not_moved_with_the_vehicle() -> None:
     often = {float(t): "abcdef"[k % 6] + "abcdef"[(k + 2) % 6] for k, t in enumerate(range(0, 120, 6))}
     assert sudden_disagreement(innovations(often)) == []
     assert sudden_disagreement(innovations({})) == []
+
+
+def test_a_beacon_that_was_moved_once_is_named_with_both_places() -> None:
+    """The estimator may take the readings after it for errors that last, and keep one place."""
+    at = np.array([np.interp(READ.times_s, W.times_s, column) for column in W.poses[:, :2].T])
+    there = np.array(BEACONS["7"])[:, None] + np.array([[0.9], [0.8]])
+    moved = np.where((READ.beacon == 1) & (READ.times_s > 60.0), np.hypot(*(there - at)), READ.range_m)
+    run = replace(SOUND, readings=READ._replace(range_m=moved, bearing_rad=np.full(moved.size, np.nan)))
+    track = EstimatedPath(
+        W.times_s, W.poses, np.broadcast_to(1e-4 * np.eye(3), (len(W.poses), 3, 3)),
+        {name: BeaconFix(x, y, 0.01 * np.eye(2)) for name, (x, y) in BEACONS.items()}, {}, 0, 0, (),
+    )  # fmt: skip
+    (line,) = stray_beacons(run, track)
+    assert "ranges of beacon 7 fit the place (" in line
+    assert " until about 60" in line
+    numbers = [float(word) for word in re.findall(r"-?\d+\.\d\d", line)]
+    assert numbers[:2] + numbers[-2:] == pytest.approx([*BEACONS["7"], *there.ravel()], abs=0.05)
+    again = track._replace(tracks={"7": BeaconTrack(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2)))})
+    assert not any("was it moved" in one for one in stray_beacons(run, again))  # another warning says it
+    assert stray_beacons(SOUND, track) == []
+    turned = track._replace(poses=W.poses + np.outer(W.times_s > 60.0, (1.5, 1.0, 0.0)))
+    assert not any("was it moved" in one for one in stray_beacons(SOUND, turned))  # the path, not the beacons
 
 
 def test_a_beacon_that_moves_is_named() -> None:

@@ -71,6 +71,9 @@ def test_scales_that_grow_together_are_not_to_be_given_a_wider_prior() -> None:
     (line,) = said(0.01, -0.2)
     assert "widen csv.priors.range_scale" in line
     assert said(0.01, 0.01) == []
+    for line in said(1.01, 2.12):  # turns in degrees
+        assert "which no calibration is: look for a wrong unit" in line
+        assert "do not widen csv.priors." in line
 
 
 def test_too_few_ranges_say_nothing() -> None:
