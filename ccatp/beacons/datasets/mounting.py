@@ -11,6 +11,7 @@ FEWEST = 100  # ranges of a radio
 LEAST_ARM_M = 0.15  # above the error of the ranges
 BETTER = 0.8  # of the misfit that remains with the other place
 SURE = 10.0  # standard errors of white ranges: those of correlated ones are several times larger
+ASIDE = 0.3  # of a place error, up to which it is along the way
 STEPS = 10  # of the reweighting
 
 
@@ -41,9 +42,12 @@ def misplaced_radios(
         name, given = ("the radio", run.antenna_m) if radio is None else (f"tag {radio.name}", radio[1:])
         ahead = f"{abs(ahead_m):.2g} m {'ahead' if ahead_m >= 0.0 else 'behind'}"
         left = f"{abs(left_m):.2g} m to the {'left' if left_m >= 0.0 else 'right'}"
+        # At a constant speed a radio behind its place is like ranges that are late; only a place aside is none.
+        along = abs(arm_m[1]) < ASIDE * abs(arm_m[0])
+        late = f", or are the ranges {'late' if arm_m[0] < 0.0 else 'early'}" if along else ""
         yield (
             f"ranges fit {what} better if {name} is about {ahead} and {left} of the vehicle's origin, not at "
-            f"{given[0]:.3g} and {given[1]:.3g} m (ahead, left): is its place given rightly?"
+            f"{given[0]:.3g} and {given[1]:.3g} m (ahead, left): is its place given rightly{late}?"
         )
 
 
