@@ -11,7 +11,7 @@ FEWEST = 100  # ranges of a radio
 LEAST_ARM_M = 0.15  # above the error of the ranges
 BETTER = 0.8  # of the misfit that remains with the other place
 SURE = 10.0  # standard errors of white ranges: those of correlated ones are several times larger
-ASIDE = 0.3  # of a place error, up to which it is along the way
+ASIDE = 0.5  # of a place error, up to which it is along the way
 STEPS = 10  # of the reweighting
 
 

@@ -149,6 +149,16 @@ def test_wrong_places_of_radios_are_named_and_right_ones_are_not() -> None:
     assert "tag rear" in exchanged
 
 
+@pytest.mark.parametrize(("late_s", "what"), [(0.6, "late"), (-0.6, "early")])
+def test_ranges_that_are_late_are_not_only_taken_for_a_radio_that_is_behind(late_s: float, what: str) -> None:
+    run = driven(5, seconds=180.0)
+    assert run.truth is not None
+    poses = truth_at(run.truth, run.readings.times_s + late_s)
+    lines = list(misplaced_radios(with_places(run, TAGS), poses, run.beacon_truth_m, "truth and survey"))
+    assert len(lines) == 2
+    assert all(line.endswith(f"is its place given rightly, or are the ranges {what}?") for line in lines)
+
+
 @pytest.mark.parametrize(("signs", "what"), [((1, -1), "left and right"), ((-1, 1), "ahead and behind")])
 def test_places_of_radios_with_another_sign_are_named_without_a_truth(signs: tuple[int, int], what: str) -> None:
     tags = (Radio("a", 0.5, 0.3), Radio("b", -0.4, -0.4))
