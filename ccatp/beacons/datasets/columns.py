@@ -144,10 +144,10 @@ def read_columns(path: Path) -> Recording:
         for one in (table, *others.values())
         if one.unknown
     ]
-    if beside := [quantity for quantity in PATH if quantity in table.quantities]:
+    if path_beside := [quantity for quantity in PATH if quantity in table.quantities]:
         warnings.append(
-            f"{table.file.name}: a path beside the readings is not used: {listed(beside)}; give a truth in a table of "
-            "its own, with truth in its name"
+            f"{table.file.name}: a path beside the readings is not used: {listed(path_beside)}; give a truth in a "
+            "table of its own, with truth in its name"
         )
     warnings += _exchanged(table)
     events = tables_of(file, _readings(table, numbers, tags))

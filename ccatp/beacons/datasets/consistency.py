@@ -419,6 +419,6 @@ def _truth_clock(truth: ReferencePath, times_s: FloatArray, path: FloatArray) ->
         turned /= np.maximum(np.abs(turned), 1e-12)
         return np.asarray(np.sqrt((np.abs(own * turned[:, None] - true) ** 2).mean(axis=1)))
 
-    (lag_s,) = _lags(misfits, [there[there]], LEAST_TRUTH_LAG_S)
+    (lag_s,) = _lags(misfits, [np.ones(int(there.sum()), dtype=bool)], LEAST_TRUTH_LAG_S)
     if lag_s:
         yield f"the truth fits the odometry best {_shifted(lag_s)}: their clocks differ, and the errors contain that"
