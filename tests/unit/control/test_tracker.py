@@ -273,7 +273,7 @@ def survey(rig: Rig) -> tuple[list[float], float]:
     return errors, taken / ideal
 
 
-@pytest.mark.parametrize("delay", [0, 2, 4])
+@pytest.mark.parametrize("delay", [0, pytest.param(2, marks=pytest.mark.slow), 4])
 def test_a_disturbed_robot_stops_within_a_third_of_a_millimetre_and_loses_little_time(
     config: Config, delay: int
 ) -> None:
