@@ -54,23 +54,36 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, tables: Path |
     return 0
 
 
-@common.command("ccatp compare runs/before runs/after", "ccatp compare runs/a runs/b --json")
-@click.argument("run_a", type=common.PATH)
-@click.argument("run_b", type=common.PATH)
-@click.option("--out", type=common.OutputFile(), metavar="FILE", help="The page; compare.html in RUN_B if not given.")
+@common.command(
+    "ccatp compare runs/before runs/after",
+    "ccatp compare before.json after.json",
+    "ccatp compare runs/a runs/b --json",
+)
+@click.argument("before", type=common.PATH)
+@click.argument("after", type=common.PATH)
+@click.option(
+    "--out",
+    type=common.OutputFile(),
+    metavar="FILE",
+    help="The page; compare.html in AFTER if not given, none if that is no run directory.",
+)
 @_FIGURES
 @_JSON
-def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
-    """Compare two runs: figures, configuration, time, errors, and which panels have moved."""
-    with common.working(f"reading and drawing {run_a} and {run_b}"):
-        from ccatp.report.compare import COMPARISON, compare_data, compare_lines, compare_runs
+def compare(before: Path, after: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
+    """Compare two surveys: figures, configuration, time, errors, which panels have moved, and whether as planned.
 
-        path = out or run_b / COMPARISON
-        pair = compare_runs(run_a, run_b, path, figures)
-    for found in (pair.a, pair.b):
+    BEFORE and AFTER are run directories, or alignments: what ccatp align --json writes, for points of
+    other instruments or with --with.
+    """
+    with common.working(f"reading and drawing {before} and {after}"):
+        from ccatp.report.compare import COMPARISON, compare_data, compare_lines, compare_surveys
+
+        path = out if out is not None or after.is_file() else after / COMPARISON
+        pair = compare_surveys(before, after, path, figures)
+    for _, found in pair.runs:
         common.warn(f"{found.record.name}: {warning}" for warning in found.record.warnings)
-    data = {"report": str(path), **compare_data(pair)}
-    common.print_result(data, [*compare_lines(pair), str(path)], json_output)
+    data = {"report": path and str(path), **compare_data(pair)}
+    common.print_result(data, [*compare_lines(pair), *([str(path)] if path else [])], json_output)
     return 0
 
 
@@ -123,6 +136,7 @@ def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: s
     "ccatp align runs/tonight --csv moves.csv --figure panels.png",
     "ccatp align runs/tonight --with runs/evening",
     "ccatp align --points tracker.csv --mirror fyst-m1 --offset-mm 19.05 --sigma-um 15",
+    "ccatp align --points tracker.csv --mirror fyst-m1 --sigma-um 15 --work-list work.csv --json > before.json",
     "ccatp align runs/tonight --json --set align.point_floor_m=2e-6",
 )
 @click.argument("run_dir", type=common.PATH, required=False)
@@ -198,7 +212,7 @@ def align(
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.mirror_alignment import align_survey, compare
     from ccatp.records.run_reader import read_run
-    from ccatp.report.alignment import result_data, table_lines, undetermined_warnings
+    from ccatp.report.alignment import config_data, result_data, table_lines, undetermined_warnings
     from ccatp.report.network import network_data, network_lines, remarks
 
     _check_effect(settings, ALIGN_KEYS, "the alignment")
@@ -226,6 +240,7 @@ def align(
     common.warn(warnings)
     lines = [*table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m), *network_lines(network)]
     data = {**facts, **result_data(result, comparison), "network": network_data(network), "warnings": warnings}
+    data["config"] = config_data(cfg)
     common.print_result(data, lines, json_output)
     return 0
 
@@ -238,7 +253,7 @@ def _align_points(
     json_output: bool,
 ) -> int:
     from ccatp.cli.align_points import align_points
-    from ccatp.report.alignment import result_data, table_lines, undetermined_warnings
+    from ccatp.report.alignment import config_data, result_data, table_lines, undetermined_warnings
 
     _check_effect(settings, (*ALIGN_KEYS, "run.mirror"), "the alignment of points")
     found = align_points(run_dir, settings, options)
@@ -262,6 +277,7 @@ def _align_points(
     common.warn(warnings)
     lines = [*table_lines(facts, found.result, None, 0.0), *found.lines]
     data = {**facts, **result_data(found.result, None), "instrument": found.data, "warnings": warnings}
+    data["config"] = config_data(found.cfg)
     common.print_result(data, lines, json_output)
     return 0
 

@@ -1,4 +1,4 @@
-"""The work at the adjusters: steps that make the moves of a survey; and how well two surveys repeat a point."""
+"""The work at the adjusters: steps that make the moves of a survey."""
 
 from collections.abc import Sequence
 from math import ceil
@@ -40,6 +40,11 @@ class WorkList(NamedTuple):
 
     steps: tuple[Step, ...]
     warnings: tuple[str, ...]
+
+    @property
+    def panels(self) -> frozenset[PanelId]:
+        """The panels that are to be moved."""
+        return frozenset(step.panel for step in self.steps)
 
 
 def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult]) -> WorkList:
@@ -97,19 +102,3 @@ def work_list(mirror: Mirror, cfg: AdjustersConfig, panels: Sequence[PanelResult
 def _names(panels: Sequence[PanelId]) -> str:
     names = [f"{panel.row}/{panel.col}" for panel in panels]
     return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
-
-
-def repeatability_m(before: Sequence[PanelResult], after: Sequence[PanelResult]) -> float | None:
-    """Standard deviation of a point: residuals of the planes of two surveys, point by point; None without any."""
-    squares, count = 0.0, 0
-    for one, other in zip(before, after, strict=True):
-        residuals = []
-        for panel in (one, other):
-            kept = [point for point, is_kept in zip(panel.deviations.points, panel.is_kept, strict=True) if is_kept]
-            residuals.append(dict(zip(kept, panel.fit.residuals_m.tolist(), strict=True)))
-        common = residuals[0].keys() & residuals[1].keys()
-        # Planes take three of the differences.
-        if len(common) > 3:
-            squares += sum((residuals[1][point] - residuals[0][point]) ** 2 for point in common)
-            count += len(common) - 3
-    return float(np.sqrt(squares / count / 2.0)) if count else None

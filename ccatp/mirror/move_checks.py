@@ -1,6 +1,6 @@
 """Whether the moves that a survey plans were made, by the change of the panels that a later survey shows."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from enum import StrEnum
 from itertools import combinations
 from typing import NamedTuple
@@ -11,6 +11,7 @@ from scipy.special import chdtrc, erfc
 from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import PanelResult
+from ccatp.mirror.panel_changes import Changes, PanelChange
 from ccatp.mirror.panel_modes import Moves, adjuster_places, rigid
 
 _SIGMAS = 4.0  # of a difference that noise does not make in the several hundred adjusters of a mirror
@@ -90,33 +91,45 @@ def made_of(planned_m: float, measured_m: float, sigma_m: float) -> Made:
 
 
 def check_moves(
-    mirror: Mirror, before: Sequence[PanelResult], after: Sequence[PanelResult], errors: tuple[slice, slice]
+    mirrors: tuple[Mirror, Mirror],
+    pairs: Sequence[tuple[PanelResult, PanelResult]],
+    changes: Changes,
+    with_work: Collection[PanelId],
 ) -> tuple[PanelCheck, ...]:
-    """Moves planned by the survey ``before``, and the change of the panels that ``after`` shows.
+    """Moves planned by the earlier survey of each pair, and the change of the panels, by the places of the adjusters.
 
     A panel that bends with its adjusters shows each move: nine points determine five. A panel that does not bend shows
-    a plane, which follows the moves by least squares: named are the fewest adjusters that explain it. ``errors``: those
-    of the errors common to the panels of a survey that differ between the surveys.
+    a plane, which follows the moves by least squares: named are the fewest adjusters that explain it. ``mirrors``: of
+    both surveys, which may order the adjusters otherwise. ``with_work``: panels that were to be moved; others have no
+    plan.
     """
-    return tuple(_check(mirror, one, other, errors) for one, other in zip(before, after, strict=True))
+    return tuple(
+        _check(mirrors, before, after, change)
+        for (before, after), change in zip(pairs, changes.panels, strict=True)
+        if before.panel in with_work
+    )
 
 
-def _check(mirror: Mirror, one: PanelResult, other: PanelResult, errors: tuple[slice, slice]) -> PanelCheck:
+def _check(mirrors: tuple[Mirror, Mirror], one: PanelResult, other: PanelResult, plane: PanelChange) -> PanelCheck:
     planned = one.rigid.moves.values_m
-    modes = rigid(adjuster_places(mirror, one.panel)[1])
+    modes = rigid(adjuster_places(mirrors[0], one.panel)[1])
     if one.bending is not None and other.bending is not None:
-        bent, covariance = _change((one.bending.moves, other.bending.moves), errors)
+        order = _order(mirrors, one.panel)
+        bent = one.bending.moves.values_m - other.bending.moves.values_m[order] - modes @ plane.common
+        # What panels share, and the common motion, change planes.
+        covariance = modes @ (plane.covariance - plane.own_covariance) @ modes.T
+        covariance += plane.variance * (_own(one.bending.moves) + _own(other.bending.moves)[np.ix_(order, order)])
         across = np.linalg.svd(modes)[0][:, modes.shape[1] :]
         if _probability(across.T @ bent, across.T @ covariance @ across) < _FALSE_ALARM:
             made = [made_of(*each) for each in zip(planned, bent, np.sqrt(np.diag(covariance)), strict=True)]
             return PanelCheck(one.panel, _moves(one, bent, covariance, made), False, ())
-    change, covariance = _change((one.rigid.moves, other.rigid.moves), errors)
+    change, covariance = modes @ plane.values, modes @ plane.covariance @ modes.T
     to_plane = np.asarray(np.linalg.pinv(modes), dtype=np.float64)
-    of_plane = to_plane @ covariance @ to_plane.T
     sigmas = np.sqrt(np.diag(covariance))
-    if _probability(to_plane @ (change - planned), of_plane) >= _FALSE_ALARM:
+    difference = plane.values - to_plane @ planned
+    if is_noise(difference, plane.covariance):
         return PanelCheck(one.panel, _moves(one, change, covariance, [Made.AS_PLANNED] * len(planned)), True, ())
-    found = _explanations(one.adjusters, planned, to_plane, to_plane @ (change - planned), of_plane, sigmas)
+    found = _explanations(one.adjusters, planned, to_plane, difference, plane.covariance, sigmas)
     concerned = {name for explanation in found for name in explanation.adjusters}
     made = [Made.OPEN if name in concerned or not found else Made.AS_PLANNED for name in one.adjusters]
     if len(found) == 1:
@@ -125,6 +138,17 @@ def _check(mirror: Mirror, one: PanelResult, other: PanelResult, errors: tuple[s
             at = one.adjusters.index(name)
             made[at] = only.made if only.made is Made.EXCHANGED else made_of(float(planned[at]), moved, sigma)
     return PanelCheck(one.panel, _moves(one, change, covariance, made), True, found)
+
+
+def _order(mirrors: tuple[Mirror, Mirror], panel: PanelId) -> list[int]:
+    """The adjusters of the second mirror in the order of the first, by their places."""
+    places, others = (adjuster_places(mirror, panel)[1] for mirror in mirrors)
+    return [int(np.argmin(np.linalg.norm(others - place, axis=1))) for place in places]
+
+
+def _own(moves: Moves) -> FloatArray:
+    """The covariance without errors that panels share."""
+    return np.asarray(moves.covariance_m2 - moves.common_m @ moves.common_m.T)
 
 
 def _explanations(
@@ -191,17 +215,13 @@ def _with_numbers(names: tuple[str, ...], planned: FloatArray, count: int) -> It
         yield Made.OPEN, tuple(names[at] for at in some), np.zeros(len(names)), np.eye(len(names))[:, list(some)]
 
 
+def is_noise(values: FloatArray, covariance: FloatArray) -> bool:
+    """Whether noise of this covariance may make the values, on any panel of a mirror."""
+    return _probability(values, covariance) >= _FALSE_ALARM
+
+
 def _probability(values: FloatArray, covariance: FloatArray) -> float:
     return float(chdtrc(len(values), values @ np.linalg.solve(covariance, values)))
-
-
-def _change(plans: tuple[Moves, Moves], errors: tuple[slice, slice]) -> tuple[FloatArray, FloatArray]:
-    """The change between two surveys at the adjusters, and its covariance without the errors that cancel."""
-    covariance = np.zeros_like(plans[0].covariance_m2)
-    for moves, part in zip(plans, errors, strict=True):
-        cancel = np.delete(moves.common_m, np.arange(moves.common_m.shape[1])[part], axis=1)
-        covariance = covariance + moves.covariance_m2 - cancel @ cancel.T
-    return plans[0].values_m - plans[1].values_m, covariance
 
 
 def _moves(one: PanelResult, change: FloatArray, covariance: FloatArray, made: Sequence[Made]) -> tuple[MoveCheck, ...]:

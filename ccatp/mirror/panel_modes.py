@@ -5,7 +5,7 @@ The displacement along a panel's normal is ``D(x, y) = sum c_i m_i(x, y)`` with 
 twist and bowl, which five adjusters can change.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -77,9 +77,8 @@ def deviations_of(
     body = mirror.panel(panel)
     feet = [mirror.foot_of_puck(one.fix.position_m, puck_height_m) for one in chosen]
     places = [body.from_deck(mirror.surface.point(x, y))[:2] for x, y, _ in feet]
-    deck = np.array([mirror.surface.drop(body.to_deck((x, y, 0.0)), body.axes[2])[:2] for x, y in places])
-    normals = [mirror.surface.normal(x, y) for x, y in deck.tolist()]
-    world = np.array([mirror.rotate_world_from_deck(normal) for normal in normals])
+    deck, normals = surface_under(mirror, panel, places)
+    world = np.array([mirror.rotate_world_from_deck((x, y, z)) for x, y, z in normals.tolist()])
     covariances = np.array([one.fix.covariance_m2 for one in chosen], dtype=np.float64).reshape(-1, 3, 3)
     variances = np.einsum("ki,kij,kj->k", world, covariances, world) + floor_m**2
     shared = None
@@ -93,11 +92,18 @@ def deviations_of(
         deck_m=deck,
         values_m=np.array([deviation for _, _, deviation in feet]),
         sigmas_m=np.sqrt(variances),
-        lever=np.array(normals) @ np.array(body.axes[2]),
+        lever=normals @ np.array(body.axes[2]),
         metrology=tuple(one.fix.metrology for one in chosen),
         common=shared,
         readings=None if readings is None else np.array([readings.get(one.point, 1) for one in chosen], np.float64),
     )
+
+
+def surface_under(mirror: Mirror, panel: PanelId, places_m: Iterable[Sequence[float]]) -> tuple[FloatArray, FloatArray]:
+    """Deck coordinates (k, 2) of the surface at (x, y) of the panel frame, and its normals (k, 3), deck frame."""
+    body = mirror.panel(panel)
+    deck = [mirror.surface.drop(body.to_deck((x, y, 0.0)), body.axes[2])[:2] for x, y in places_m]
+    return np.array(deck), np.array([mirror.surface.normal(x, y) for x, y in deck])
 
 
 Modes = Callable[[FloatArray], FloatArray]

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.config.models import Config
 from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult
@@ -92,6 +93,11 @@ def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str
     }
 
 
+def config_data(cfg: Config) -> dict[str, Any]:
+    """Configuration of the alignment in the output of ``ccatp align --json``."""
+    return {"mirror": cfg.mirror.model_dump(mode="json"), "align": cfg.align.model_dump(mode="json")}
+
+
 def panel_data(panel: PanelResult) -> dict[str, Any]:
     """Position and tilt of a panel, its moves and its points."""
     piston, tip, tilt = _list(panel.fit.values)
@@ -101,7 +107,10 @@ def panel_data(panel: PanelResult) -> dict[str, Any]:
     one, y, x = np.array([np.ones(len(found.points)), *found.places_m.T[::-1]])
     left = found.values_m - found.lever * (np.column_stack([one, y, x]) @ panel.fit.values)
     rows = zip(found.points, found.places_m, found.values_m, found.sigmas_m, left, panel.is_kept, strict=True)
-    marks = found.metrology or [""] * len(found.points)
+    count = len(found.points)
+    common = np.zeros((count, 0)) if found.common is None else found.common
+    readings = [1] * count if found.readings is None else found.readings.astype(int).tolist()
+    more = zip(found.metrology or [""] * count, readings, common, strict=True)
     return {
         "row": panel.panel.row,
         "col": panel.panel.col,
@@ -150,8 +159,12 @@ def panel_data(panel: PanelResult) -> dict[str, Any]:
                 "residual_um": _um(residual),
                 "is_outlier": not is_kept,
                 "metrology": metrology,
+                "readings": number,
+                "common_um": _list(errors),
             }
-            for (point, (x_m, y_m), value, sigma, residual, is_kept), metrology in zip(rows, marks, strict=True)
+            for (point, (x_m, y_m), value, sigma, residual, is_kept), (metrology, number, errors) in zip(
+                rows, more, strict=True
+            )
         ],
     }
 

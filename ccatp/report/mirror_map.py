@@ -1,6 +1,7 @@
 """Maps of a mirror (deck frame, x to the right): driven path with arrival errors, plan, surface of the panels."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from math import ceil, cos, sin
 from pathlib import Path
@@ -14,7 +15,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
-from ccatp.core import FloatArray, StopKind
+from ccatp.core import FloatArray, PanelId, StopKind
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import SurveyResult
 from ccatp.mirror.panel_alignment import PanelResult, on_grid_m
@@ -264,15 +265,20 @@ def surface_figure(
 
 
 def change_figure(
-    mirror: Mirror, before: Sequence[PanelResult], after: Sequence[PanelResult], width_px: float
+    mirror: Mirror,
+    before: Sequence[PanelResult],
+    after: Sequence[PanelResult],
+    common: Mapping[PanelId, FloatArray],
+    width_px: float,
 ) -> Figure:
-    """The later survey minus the earlier one."""
+    """The later survey minus the earlier one, without what panels have in ``common``: piston (m), tip, tilt (rad)."""
     axes = new_mirror_map(mirror, width_px, f"{mirror.name}: change of the surface")
     earlier = {panel.panel: panel for panel in before}
     cells = []
     for panel in after:
         if panel.panel in earlier:
-            x, y, later = on_grid_m(mirror, panel, _CELLS_NARROW)
+            shifted = replace(panel, fit=panel.fit._replace(values=panel.fit.values - common[panel.panel]))
+            x, y, later = on_grid_m(mirror, shifted, _CELLS_NARROW)
             cells.append((x, y, later - on_grid_m(mirror, earlier[panel.panel], _CELLS_NARROW)[2]))
     drawn = _draw_cells(axes, cells, [values_m.ravel() for _, _, values_m in cells])
     return _finished(axes, drawn, "change along the normal, µm (> 0 towards the robot)", width_px, extend="both")

@@ -10,7 +10,7 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.core import PointId
 from ccatp.mirror.mirror import build_mirror
-from ccatp.report.compare import compare_runs
+from ccatp.report.compare import compare_surveys
 from tests.support.runs import RecordedRun
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def test_the_pages_open_by_themselves(recorded_run: RecordedRun, tmp_path: Path)
 
     recorded = recorded_run.run_dir
     report = recorded / "report.html"
-    compare_runs(recorded, recorded, tmp_path / "compare.html")
+    compare_surveys(recorded, recorded, tmp_path / "compare.html")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = opened(browser, report, 1100, figures=4)

@@ -8,12 +8,13 @@ import pytest
 
 from ccatp.config.models import AdjustersConfig
 from ccatp.core import DeckPose, Fix, Measured, PanelId
-from ccatp.mirror.adjuster_work import repeatability_m, work_list
+from ccatp.mirror.adjuster_work import work_list
 from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.mirror_alignment import survey_result
 from ccatp.mirror.misalignment import PanelMisalignment
-from ccatp.mirror.move_checks import Made, check_moves, made_of
+from ccatp.mirror.move_checks import Made, PanelCheck, check_moves, made_of
 from ccatp.mirror.panel_alignment import PanelResult
+from ccatp.mirror.panel_changes import panel_changes, point_repeat
 from ccatp.mirror.panel_modes import adjustable, adjuster_places, rigid
 from tests.support.scenario import world_of
 
@@ -22,7 +23,6 @@ CFG, M1 = world_of()
 PANEL = PanelId(4, 5)
 LIES = PanelMisalignment(120e-6, -180e-6, 90e-6)
 SIGMA_M = 2e-6
-ALL = slice(None), slice(None)
 
 
 def surveyed(displacement: np.ndarray, seed: int) -> PanelResult:
@@ -51,6 +51,13 @@ def after(turned: dict[str, float], seed: int = 2) -> PanelResult:
     shares = np.array([turned.get(name, 1.0) for name in BEFORE.adjusters])
     made = np.linalg.solve(adjustable(places), shares * BEFORE.rigid.moves.values_m)
     return surveyed(START + made, seed)
+
+
+def checked(later: PanelResult) -> PanelCheck:
+    changes = panel_changes(M1, [(BEFORE, later)], planned=-BEFORE.fit.values[None, :])
+    assert changes is not None
+    (found,) = check_moves((M1, M1), [(BEFORE, later)], changes, [PANEL])
+    return found
 
 
 def test_the_steps_add_up_to_the_moves_and_exceed_no_limit() -> None:
@@ -142,7 +149,7 @@ def test_a_move_is_judged_by_its_sigma(planned: float, measured: float, made: Ma
 def test_the_next_survey_shows_which_adjuster_was_not_moved_as_planned(
     turned: dict[str, float], wrong: dict[str, Made]
 ) -> None:
-    (found,) = check_moves(M1, [BEFORE], [after(turned)], ALL)
+    found = checked(after(turned))
     assert {one.adjuster: one.made for one in found.moves if one.made is not Made.AS_PLANNED} == wrong
 
 
@@ -175,21 +182,20 @@ PLANNED_M = BEFORE.rigid.moves.values_m
 def test_a_plane_names_the_fewest_adjusters_that_explain_it(
     moved_m: np.ndarray, explanations: set[tuple[Made, str]], made: dict[str, Made]
 ) -> None:
-    (found,) = check_moves(M1, [BEFORE], [rigid_after(moved_m)], ALL)
+    found = checked(rigid_after(moved_m))
     assert found.is_plane
     assert {(one.made, " ".join(one.adjusters)) for one in found.explanations} == explanations
     assert {one.adjuster: one.made for one in found.moves if one.made is not Made.AS_PLANNED} == made
 
 
 def test_a_plane_that_many_adjusters_explain_names_none() -> None:
-    (found,) = check_moves(
-        M1, [BEFORE], [rigid_after(PLANNED_M + 1e-6 * np.array([60.0, -35.0, 95.0, 0.0, -80.0]))], ALL
-    )
+    found = checked(rigid_after(PLANNED_M + 1e-6 * np.array([60.0, -35.0, 95.0, 0.0, -80.0])))
     assert (found.is_plane, found.explanations, found.is_as_planned) == (True, (), False)
     assert {one.made for one in found.moves} == {Made.OPEN}
 
 
 def test_the_repeatability_of_a_point_is_its_noise() -> None:
-    values = [repeatability_m([surveyed(START, 2 * k)], [surveyed(START, 2 * k + 1)]) or 0.0 for k in range(20)]
+    pairs = [(surveyed(START, 2 * k), surveyed(START, 2 * k + 1)) for k in range(30)]
+    values = [point_repeat([pair]).sigma_m or 0.0 for pair in pairs]
     # 120 degrees of freedom: known to 6 %; four sigmas.
     assert np.sqrt(np.mean(np.square(values))) == pytest.approx(SIGMA_M, rel=0.26)

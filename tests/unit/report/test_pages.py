@@ -25,7 +25,7 @@ from ccatp.errors import ConfigError
 from ccatp.links.topics import FixMessage
 from ccatp.records.state_log import LogLine
 from ccatp.report.alignment import worst_corner
-from ccatp.report.compare import RunPair, compare_lines, compare_page, compared_figures
+from ccatp.report.compare import SurveyPair, compare_lines, compare_page, compared_figures, read_survey, survey_of
 from ccatp.report.findings import findings_of, outcome_of
 from ccatp.report.html import POLICY, environment, events_of, micro_text
 from ccatp.report.record import SurveyFiles, changed_keys, read_record
@@ -127,7 +127,7 @@ def test_text_stays_text(without: Callable[..., Path]) -> None:
     spoilt = findings_of(replace(whole, warnings=(evil,), missing=(evil,), **texts))  # type: ignore[arg-type]
     page = run_page(spoilt)
     assert page.count(str(escape(evil))) >= 6
-    for found in (page, compare_page(RunPair(spoilt, findings_of(whole)))):
+    for found in (page, compare_page(SurveyPair(survey_of(spoilt), survey_of(findings_of(whole))))):
         Markup(found)
         assert evil not in found
 
@@ -295,7 +295,7 @@ def test_panels_that_moved_are_found(recorded: Path, tmp_path: Path, capsys: pyt
 
 def test_a_run_beside_itself_says_that_nothing_differs(recorded: Path) -> None:
     found = findings_of(read_record(recorded))
-    lines = compare_lines(RunPair(found, found))
+    lines = compare_lines(SurveyPair(survey_of(found), survey_of(found)))
     assert lines[0] == "no figure differs"
     assert lines[1].startswith("the surveys agree")
 
@@ -310,7 +310,7 @@ def test_ports_that_a_simulation_chose_are_no_change() -> None:
 
 def test_different_mirrors_are_not_compared_point_by_point(recorded: Path, tmp_path: Path) -> None:
     thesis = record(tmp_path / "thesis", run__mirror="thesis-m1", only=2)
-    pair = RunPair(findings_of(read_record(recorded)), findings_of(read_record(thesis)))
+    pair = SurveyPair(read_survey(recorded), read_survey(thesis))
     page = compare_page(pair)
     assert Markup(page).anchors == ["figures", "configuration", "time", "errors", "events"]
     warning = "The runs are of different mirrors, fyst-m1 and thesis-m1: points and panels are not compared."
