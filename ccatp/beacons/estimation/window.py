@@ -57,7 +57,7 @@ SETTLED = 50  # iterations: the variance falls by a factor of FREEDOM + 1 in one
 FREEDOM = 8.0  # of Student's t of a calibration: one of several cores costs less than a Gaussian would take
 # Standard deviation of a calibration among instruments, as a share of the prior, which is that of the worst ones.
 # Covariances are those of errors with this spread, though the estimate assumes the core, which is narrower.
-USUAL = 0.5
+USUAL = 0.7
 # Levels are left out: the spread of transmitters is no fault of an instrument.
 INSTRUMENTAL = (
     *CALIBRATION, "range_scale", "range_offset_m", "bearing_offset_rad", *ANTENNA, HEIGHT_M2,

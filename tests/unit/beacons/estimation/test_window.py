@@ -130,7 +130,7 @@ def test_a_calibration_far_from_zero_is_found_and_one_near_zero_stays_there() ->
     given = Settings(CONFIG.csv, CONFIG.filter)
     sure, free = (estimated(one, given, CONFIG.fixed_lag).calibration["range_scale"] for one in (run, scaled))
     assert abs(sure.value) < 0.02
-    assert sure.sigma < 0.02
+    assert sure.sigma < 0.025  # that of the distance's scale is 0.014, and readings tell the ratio of both alone
     assert free.value == pytest.approx(0.08, abs=3.0 * free.sigma)
 
 
