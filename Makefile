@@ -52,6 +52,7 @@ help:
 	@echo "Programs that are started by hand, in $(VENV)/bin; --help and the first lines of each file say more:"
 	@echo "python -m tools.gap_campaign             is the estimate consistent in gaps of the samples; hours [--seeds 20]"
 	@echo "python -m tools.network_campaign         errors and intervals of synthetic laser networks; minutes [--networks 1000] [--workers 2]"
+	@echo "python -m tools.compare_campaign         are adjustments of panels verified rightly by points of two surveys; minutes [--pairs 100]"
 	@echo "python -m tools.network_surveys          the same of whole simulated surveys; an hour [--surveys 20]"
 	@echo "python -m tools.network_picture          docs/network.png"
 	@echo "python -m tools.night FOLDER             a night with six faults, and docs/night.md of it"
