@@ -88,7 +88,7 @@ class SurveyPair:
 
     ``wavefronts``: half-wavefront errors of the panels that both surveys have, or None. ``checks``: by panel, the moves
     that A plans against the change that B shows, if any panel has moved; ``as_planned``: panels that have changed so.
-    ``remarks``: what the comparison cannot tell, or what seems to be wrong with it.
+    ``remarks``: what the comparison cannot determine, or what seems to be wrong with it.
 
     Points and panels are compared only if the mirror is the same; otherwise ``warning`` is not empty.
     """

@@ -45,7 +45,7 @@ LEAST_TRUTH_LAG_S = 0.15  # of the truth, which no estimator uses: nothing calib
 BETTER = 0.6  # of the misfit that remains with a lag, or in another unit
 MAJORITY = 0.65  # of the windows fit better
 LEAST_HEIGHT_M = 1.0
-TOLD = 0.3  # of the usual range: standard deviation of a beacon's place, up to which a window tells it
+DETERMINED = 0.3  # of the usual range: standard deviation of a beacon's place, up to which a window determines it
 FIRST_ARM_M, FINE_ARM_M, MOST_TRIES = 0.3, 0.01, 80  # of the search for the place of a radio on the vehicle
 LEAST_ARM_M, MOST_ARM_M = 0.15, 10.0  # above the error of the ranges, and as long as vehicles are
 CLEARLY = 0.9  # of the misfit that remains with another clock, or with another sign
@@ -233,8 +233,8 @@ class _Windows:
     def heights_m2(self, times_s: FloatArray, path: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Square of the height of the beacon over the path that a window fits, and its sigma, m^2, shape (k,).
 
-        With a height h the free term is |b|^2 + h^2. Windows that do not tell the place b are left out: there all of
-        the range would be height, as where the vehicle stands.
+        With a height h the free term is |b|^2 + h^2. Windows that do not determine the place b, as where the vehicle
+        stands, are left out: there all of the range would be height.
         """
         fitted = self._fitted(self._centred(self._seen.radios_at(_poses(times_s, path, self.times_s))))
         counts = np.bincount(self.group, minlength=self.count)
@@ -243,9 +243,9 @@ class _Windows:
         variance = np.einsum("na,nab,nb->n", slope, spread, slope)
         of_place_m2 = 0.25 * np.trace(spread[:, :2, :2], axis1=1, axis2=2)
         usual_m = np.bincount(self.group, self.range_m, self.count) / counts
-        told = of_place_m2 < (TOLD * usual_m) ** 2
+        is_known = of_place_m2 < (DETERMINED * usual_m) ** 2
         squares_m2 = fitted.terms[:, 2] - 0.25 * (fitted.terms[:, :2] ** 2).sum(axis=1)
-        return squares_m2[told], np.sqrt(np.maximum(variance, 0.0))[told]
+        return squares_m2[is_known], np.sqrt(np.maximum(variance, 0.0))[is_known]
 
     def _centred(self, at: FloatArray) -> FloatArray:
         counts = np.bincount(self.group, minlength=self.count)

@@ -193,7 +193,7 @@ def stray_beacons(run: RecordedRun, track: EstimatedPath) -> list[str]:
 def _moved_once(name: str, times_s: FloatArray, range_m: FloatArray, at: FloatArray, fix: BeaconFix) -> str:
     """A warning if the ranges (m,) from places (m, 2) fit two places of the beacon, one after the other, far better.
 
-    The cut is where they fit best; the shorter part then tells whether the place of the other one is its own, too.
+    The cut is where they fit best; the shorter part then decides: its own place must fit it far better.
     """
     place = np.array(fix[:2])
     most_m = max(MOVED_M, OUTLYING * float(np.median(_misses(range_m, at, place_by_ranges(range_m, at, place)))))

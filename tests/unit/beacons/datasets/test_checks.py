@@ -138,7 +138,7 @@ def test_a_sound_run_raises_no_suspicion() -> None:
 
 def test_noise_of_the_odometry_is_no_scale_of_its_turns() -> None:
     """The slope of the truth on noisy turns is too small: turns of a fast vehicle change little between two chords."""
-    noise = np.random.default_rng(5).normal(0.0, 0.012, SOUND.steps.turn_rad.size)
+    noise = np.random.default_rng(5).normal(0.0, 0.04, SOUND.steps.turn_rad.size)
     assert not any("true turns" in line for line in suspicions(with_steps(turn_rad=SOUND.steps.turn_rad + noise)))
 
 
