@@ -13,7 +13,7 @@ from ccatp.beacons.datasets.mounting import robust_fit
 from ccatp.beacons.datasets.tables import instant, listed
 from ccatp.beacons.estimation.predictions import place_by_ranges
 from ccatp.beacons.estimation.range_noise import correlations
-from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, KnownMap, RecordedRun
+from ccatp.beacons.estimation.recording import EstimatedPath, KnownMap, RecordedRun
 from ccatp.beacons.estimation.track_review import range_residuals
 from ccatp.beacons.rigid_motion import aligned_rms_m
 from ccatp.core import FloatArray
@@ -153,8 +153,7 @@ def map_against_survey(known: KnownMap, surveyed_m: Mapping[str, tuple[float, fl
 STRAY = 5.0  # times the usual miss of the beacons
 PARTS = 8  # of the readings of a beacon, between which it may have been moved
 MOVED_M = 0.5  # distance of two places of a beacon that was moved, at least,
-HALVED = 0.4  # and the share of its misses at the other place that its own one leaves, at most
-DRIFTS = 2.0  # standard deviations of the place on the map by which it may seem to move, because the path drifts
+HALVED = 0.4  # and the share of its misses at the other place that its own one leaves, predicted, at most
 OUTLYING = 3.0  # medians, or ``MOVED_M``, at which misses are cut off
 
 
@@ -172,7 +171,7 @@ def stray_beacons(run: RecordedRun, track: EstimatedPath) -> list[str]:
             misses_m[name] = float(np.median(np.abs(off_m - np.median(off_m))))
             calibrated_m = track.calibrated(seen, run.beacon_ids).range_m
             if name not in track.tracks and (
-                line := _moved_once(name, seen.times_s, calibrated_m, at, track.beacons[name])
+                line := _moved_once(name, seen.times_s, calibrated_m, at, np.array(track.beacons[name][:2]))
             ):
                 moved.append((name, line))
     if len(misses_m) < LEAST_BEACONS:
@@ -190,54 +189,45 @@ def stray_beacons(run: RecordedRun, track: EstimatedPath) -> list[str]:
     ]
 
 
-def _moved_once(name: str, times_s: FloatArray, range_m: FloatArray, at: FloatArray, fix: BeaconFix) -> str:
+def _moved_once(name: str, times_s: FloatArray, range_m: FloatArray, at: FloatArray, place: FloatArray) -> str:
     """A warning if the ranges (m,) from places (m, 2) fit two places of the beacon, one after the other, far better.
 
-    The cut is where they fit best; the shorter part then decides: its own place must fit it far better.
+    ``place``: on the map. The cut is where they fit best. Each part must then be consistent in itself: the place by
+    one half of its readings predicts the other half far better than the place of the other part does. Where the path
+    drifts, or where a beacon is seen from one direction, it does not.
     """
-    place = np.array(fix[:2])
     most_m = max(MOVED_M, OUTLYING * float(np.median(_misses(range_m, at, place_by_ranges(range_m, at, place)))))
+
+    def fitted(rows: slice) -> FloatArray:
+        return place_by_ranges(range_m[rows], at[rows], place)
 
     def miss_m(rows: slice, at_place: FloatArray) -> float:
         return float(np.minimum(_misses(range_m[rows], at[rows], at_place), most_m).sum())
 
-    best: tuple[float, int, list[FloatArray]] | None = None
-    for cut in np.unique(np.linspace(0, len(times_s), PARTS + 1).astype(int)[1:-1]).tolist():
-        if min(cut, len(times_s) - cut) < FEWEST:
+    n = len(times_s)
+    best: tuple[float, int, tuple[FloatArray, FloatArray]] | None = None
+    for cut in np.unique(np.linspace(0, n, PARTS + 1).astype(int)[1:-1]).tolist():
+        if min(cut, n - cut) < FEWEST:
             continue
-        parts = slice(cut), slice(cut, None)
-        places = [place_by_ranges(range_m[rows], at[rows], place) for rows in parts]
-        both_m = sum(miss_m(rows, one) for rows, one in zip(parts, places, strict=True))
+        places = fitted(slice(cut)), fitted(slice(cut, n))
+        both_m = miss_m(slice(cut), places[0]) + miss_m(slice(cut, n), places[1])
         if best is None or both_m < best[0]:
             best = both_m, cut, places
     if best is None:
         return ""
     both_m, cut, (first, second) = best
-    short, own, other = (slice(cut), first, second) if 2 * cut < len(times_s) else (slice(cut, None), second, first)
-    # Of half the readings, because their errors last; and twice the deviation of the map, because the path drifts too.
-    way, usual_m = second - first, both_m / len(times_s)
-    spread = sum(
-        2.0 * usual_m**2 * np.linalg.inv(u.T @ u + 1e-9 * np.eye(2))
-        for u in (_towards(first, at[:cut]), _towards(second, at[cut:]))
-    )
-    spread = spread + (DRIFTS / CERTAIN) ** 2 * fix.covariance
-    is_far = float(np.hypot(*way)) > max(MOVED_M, STRAY * usual_m)
-    if (
-        not is_far
-        or way @ np.linalg.solve(spread, way) < CERTAIN**2
-        or miss_m(short, own) > HALVED * miss_m(short, other)
-    ):
+    if float(np.hypot(*(second - first))) < max(MOVED_M, STRAY * both_m / n):
         return ""
+    for begin, end, other in ((0, cut, second), (cut, n, first)):
+        halves = slice(begin, (begin + end) // 2), slice((begin + end) // 2, end)
+        predicted_m = sum(miss_m(rows, fitted(by)) for rows, by in (halves, halves[::-1]))
+        if predicted_m > HALVED * miss_m(slice(begin, end), other):
+            return ""
     return (
         f"ranges of beacon {name} fit the place ({first[0]:.2f}, {first[1]:.2f}) until about {instant(times_s[cut])} "
         f"and ({second[0]:.2f}, {second[1]:.2f}) afterwards: was it moved? The map has one place of it; give its later "
         "readings another name"
     )
-
-
-def _towards(place: FloatArray, at: FloatArray) -> FloatArray:
-    way = place - at
-    return np.asarray(way / np.maximum(np.hypot(*way.T), 1e-3)[:, None])
 
 
 def _misses(range_m: FloatArray, at: FloatArray, place: FloatArray) -> FloatArray:
