@@ -33,6 +33,16 @@ def one_line(text: str, longest: int = LONGEST_LINE) -> str:
     return line if len(line) <= longest else f"{line[:begin]}...{line[-end:]}"
 
 
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """``6, 7, 8``, shortened if there are more than ``most``."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def counted(what: str, names: Sequence[str], most: int = 8) -> str:
+    """``beacon 6``, or ``beacons 6, 7, 8``."""
+    return f"{what}{'s' if len(names) > 1 else ''} {listed(names, most)}"
+
+
 class CcatpError(Exception):
     """Base of the expected errors: ``str(error)`` is one line that says what is wrong and what to do."""
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, PanelId
+from ccatp.errors import counted
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, half_size_m, mirror_wavefront
@@ -62,12 +63,7 @@ def undetermined_warnings(result: SurveyResult) -> list[str]:
     for one in result.undetermined:
         if one.points:
             whys.setdefault(one.why, []).append(f"{one.panel.row}/{one.panel.col}")
-    return [
-        f"panel{'s' if len(names) > 1 else ''} {', '.join(names[:_SHOWN])}"
-        + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
-        + f" not determined: {why}"
-        for why, names in whys.items()
-    ]
+    return [f"{counted('panel', names, _SHOWN)} not determined: {why}" for why, names in whys.items()]
 
 
 def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from ccatp.config.files import write_file
 from ccatp.config.models import MirrorConfig
 from ccatp.core import PanelId
-from ccatp.errors import UsageError
+from ccatp.errors import UsageError, counted
 from ccatp.mirror.adjuster_work import work_list
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.move_checks import Made, MoveExplanation, PanelCheck, check_moves, is_noise
@@ -200,9 +200,7 @@ def _remarks(pair: SurveyPair, common: Sequence[PanelId], moved: Sequence[PanelI
 
 
 def _names(panels: Sequence[PanelId]) -> str:
-    names = [f"{panel.row}/{panel.col}" for panel in panels]
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return f"panel{'s' if len(names) > 1 else ''} {', '.join(names[:_NAMED])}{more}"
+    return counted("panel", [f"{panel.row}/{panel.col}" for panel in panels], _NAMED)
 
 
 def compare_surveys(before: Path, after: Path, out: Path | None, figures: Path | None = None) -> SurveyPair:

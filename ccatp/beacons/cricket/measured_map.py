@@ -27,13 +27,13 @@ from ccatp.beacons.cricket.range_network import (
     build_network,
     coordinates_of,
     every_pair,
-    list_names,
 )
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
 from ccatp.beacons.cricket.self_mapping import MoteMapper, run_phase_two
 from ccatp.beacons.estimation.track_review import next_range
 from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
 from ccatp.core import FloatArray
+from ccatp.errors import listed
 
 _SIGNIFICANT = 12.0  # decrease of chi-squared by one offset; by chance once in two thousand
 _CHANCE = 1e-4  # probability over all pairs that correct ranges of one pair disagree as much
@@ -67,7 +67,7 @@ def _doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[st
     ``factor``: sigmas found from the residuals, over the given ones.
     """
     for fold in found.folds[:_FOLDS]:
-        motes = list_names([network.names[mote] for mote in fold.motes])
+        motes = listed([network.names[mote] for mote in fold.motes])
         yield f"{motes}: the mirror image fits almost as well (chi-squared {fold.cost_gap:.1f} more)"
     in_space = _SHAPES if network.bodies else ""
     in_space += _IN_SPACE if network.dimension == 2 else ""
@@ -80,7 +80,7 @@ def _doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[st
         )
     elif rows:
         pairs = [f"{network.names[network.first[row]]} to {network.names[network.second[row]]}" for row in rows]
-        yield f"{len(rows)} of {count} ranges contradict the others and count for little: {list_names(pairs)}"
+        yield f"{len(rows)} of {count} ranges contradict the others and count for little: {listed(pairs)}"
     if factor > _SCATTER:
         yield (
             f"ranges scatter by {1e3 * found.sigma_m:.3g} mm, {factor:.1f} times what they were taken for: they are "
@@ -256,7 +256,7 @@ def _network(cfg: CricketConfig, file: MeasuredRanges, tags_m: Places | None) ->
     bodies = []
     for pose, motes in file.groups.items():
         if unknown := [file.tags[mote] for mote in motes if file.tags[mote] not in tags_m]:
-            raise MappingError(f"--tags: no place of {unknown[0]}; there are {list_names(list(tags_m))}")
+            raise MappingError(f"--tags: no place of {unknown[0]}; there are {listed(list(tags_m))}")
         local = np.array([tags_m[file.tags[mote]][: cfg.dimension] for mote in motes], dtype=np.float64)
         bodies.append(RigidBody(pose, tuple(index[mote] for mote in motes), local))
     return build_network(file.readings, cfg.dimension, names, bodies)
@@ -307,7 +307,7 @@ def _filter(cfg: CricketConfig, network: RangeNetwork, first: _Found) -> _Found:
 
 def _truth(truth_m: Places, names: tuple[str, ...], dimension: int) -> FloatArray:
     if lost := [name for name in names if name not in truth_m]:
-        raise MappingError(f"--truth: no place of {list_names(lost)}; there are {list_names(list(truth_m))}")
+        raise MappingError(f"--truth: no place of {listed(lost)}; there are {listed(list(truth_m))}")
     if short := [name for name in names if len(truth_m[name]) < dimension]:
         raise MappingError(f"--truth: {short[0]} has {len(truth_m[short[0]])} coordinates, wanted {dimension}")
     return np.array([truth_m[name][:dimension] for name in names], dtype=np.float64)

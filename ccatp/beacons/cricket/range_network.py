@@ -14,7 +14,7 @@ from ccatp.beacons.config.models import CricketConfig
 from ccatp.beacons.config.onboard_models import COLDEST_C, HOTTEST_C
 from ccatp.beacons.rigid_motion import RigidMotion, best_motion
 from ccatp.core import FloatArray
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.errors import CcatpError, ExitStatus, listed
 
 ABSOLUTE_ZERO_C = -273.15
 
@@ -33,8 +33,6 @@ class MoteRange(NamedTuple):
 
 
 IndexArray = NDArray[np.intp]
-
-_SHOWN = 6  # names in a message
 
 
 class MappingError(CcatpError):
@@ -164,18 +162,10 @@ def sides(count: int, pairs: IndexArray, without: Sequence[int]) -> list[tuple[i
     return [tuple(np.flatnonzero(labels == label).tolist()) for label in np.unique(labels[labels >= 0])]
 
 
-def list_names(names: Sequence[str]) -> str:
-    """The first few names, and the number of the others."""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
-
-
 def _check_row(row: MoteRange, index: dict[str, int]) -> None:
     for name in (row.first, row.second):
         if name not in index:
-            raise MappingError(
-                f"range {row.first} to {row.second}: no mote {name!r}; there are {list_names(list(index))}"
-            )
+            raise MappingError(f"range {row.first} to {row.second}: no mote {name!r}; there are {listed(list(index))}")
     if row.first == row.second:
         raise MappingError(f"range {row.first} to {row.second}: from a mote to itself; leave it out")
     if not 0.0 <= row.range_m < float("inf"):
@@ -194,7 +184,7 @@ def _check_connected(network: RangeNetwork) -> None:
         return
     lost = [network.names[mote] for mote in np.flatnonzero(labels == sizes.argmin())]
     raise MappingError(
-        f"the motes fall into {len(sizes)} parts with no range between them: {list_names(lost)} on one side; "
+        f"the motes fall into {len(sizes)} parts with no range between them: {listed(lost)} on one side; "
         "measure a range across, or map the parts one by one"
     )
 

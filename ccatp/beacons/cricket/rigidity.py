@@ -15,11 +15,11 @@ from ccatp.beacons.cricket.range_network import (
     coordinates_of,
     every_pair,
     graph_pairs,
-    list_names,
     sides,
 )
 from ccatp.beacons.rigid_motion import rigid_modes
 from ccatp.core import FloatArray
+from ccatp.errors import listed
 
 _NULL = 1e-10  # of the largest eigenvalue; below it no range determines the direction
 _STILL = 1e-6  # of the fastest speed; below it a mote does not move
@@ -132,7 +132,7 @@ def _flexes(moves: FloatArray, points: FloatArray, network: RangeNetwork) -> tup
     for row in _echelon(U[:, singular > 1e-7].T, coordinates_of(np.argsort(steps, kind="stable"), d)):
         speeds = np.linalg.norm(row.reshape(count, d), axis=1)
         moving = [names[mote] for mote in np.flatnonzero(speeds > _STILL * speeds.max())]
-        lines[f"{list_names(moving)} against {list_names([names[mote] for mote in base])}"] += 1
+        lines[f"{listed(moving)} against {listed([names[mote] for mote in base])}"] += 1
     return tuple(line if times == 1 else f"{line} ({times} ways)" for line, times in lines.items())
 
 
@@ -261,12 +261,12 @@ def _warnings(
 ) -> Iterator[str]:
     names, shape = network.names, "line" if network.dimension == 2 else "plane"
     for separator, motes in mirrors[:_SHOWN]:
-        held = list_names([names[mote] for mote in separator])
-        yield f"{list_names([names[mote] for mote in motes])} may be mirrored across the {shape} through {held}"
+        held = listed([names[mote] for mote in separator])
+        yield f"{listed([names[mote] for mote in motes])} may be mirrored across the {shape} through {held}"
     if len(mirrors) > _SHOWN:
         yield f"and {len(mirrors) - _SHOWN} more sets of motes may be mirrored"
     if not mirrors and single_pairs:
-        shown = list_names([f"{names[i]} to {names[j]}" for i, j in single_pairs])
+        shown = listed([f"{names[i]} to {names[j]}" for i, j in single_pairs])
         yield f"ranges that nothing confirms, so that several maps may fit: {shown}"
     if not mirrors and not single_pairs:
         yield "several maps may fit all ranges; a few more pairs would exclude it"

@@ -8,9 +8,10 @@ import numpy as np
 
 from ccatp.beacons.cricket.map_fit import robust_loss
 from ccatp.beacons.cricket.mote_plan import MotePlan
-from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, RigidBody, list_names
+from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, RigidBody
 from ccatp.beacons.rigid_motion import RigidMotion
 from ccatp.core import FloatArray
+from ccatp.errors import listed
 
 _APART = 10.0  # distance in sigmas above which two solutions are different
 _ALIKE = 9.0  # difference of chi-squared below which the mirror image may be the true position
@@ -118,7 +119,7 @@ def _laid_out(plan: MotePlan, means: PairMeans, max_dop: float) -> FloatArray:
     places_m[origin], places_m[axis] = 0.0, (0.0, _ranges(plan, means, axis, [origin])[0][0])
     for mote, references, stand in _steps(plan):
         ranges, sigmas = _ranges(plan, means, mote, references)
-        anchors_m, listed = places_m[references], list_names([plan.names[other] for other in references])
+        anchors_m, names = places_m[references], listed([plan.names[other] for other in references])
         if stand is None:
             (a, b), c = ranges, anchors_m[1, 1]
             places_m[mote] = _by_cosines(a, b, c)
@@ -132,7 +133,7 @@ def _laid_out(plan: MotePlan, means: PairMeans, max_dop: float) -> FloatArray:
             apart_m = float(np.linalg.norm(found_m[1] - found_m[0]))
             if apart_m > _APART * float(sigmas.max()) and abs(costs[1] - costs[0]) < _ALIKE:
                 raise DegenerateStep(
-                    f"{plan.names[mote]} from {listed}: the mirror image across them, {apart_m:.3g} m away, fits as "
+                    f"{plan.names[mote]} from {names}: the mirror image across them, {apart_m:.3g} m away, fits as "
                     "well; spread the motes it is measured from"
                 )
             places_m[mote] = found_m[np.argmin(costs)]
@@ -141,7 +142,7 @@ def _laid_out(plan: MotePlan, means: PairMeans, max_dop: float) -> FloatArray:
         dop = _dilution(places_m[mote] - (anchors_m if stand is None else stand.placed(places_m)))
         if not dop <= max_dop:
             raise DegenerateStep(
-                f"{plan.names[mote]} from {listed}: dilution of precision {dop:.4g} exceeds {max_dop:.4g}; spread the "
+                f"{plan.names[mote]} from {names}: dilution of precision {dop:.4g} exceeds {max_dop:.4g}; spread the "
                 "motes it is measured from"
             )
     return places_m

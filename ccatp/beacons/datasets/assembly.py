@@ -9,7 +9,7 @@ from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.events import EVENTS, MOTIONS, READING_KINDS, Recording
 from ccatp.beacons.datasets.ordering import in_seconds, ordered
 from ccatp.beacons.datasets.placeholders import frozen, measured, step_of, true_positions, without_wild_steps
-from ccatp.beacons.datasets.tables import RadioDataError, Table, instant, listed, long_pauses, needed_of, plural, within
+from ccatp.beacons.datasets.tables import RadioDataError, Table, instant, long_pauses, needed_of, plural, within
 from ccatp.beacons.datasets.tags import from_the_vehicle, radios_of
 from ccatp.beacons.datasets.trajectory import (
     BEFORE_S,
@@ -23,6 +23,7 @@ from ccatp.beacons.datasets.trajectory import (
 )
 from ccatp.beacons.estimation.recording import Known, KnownMap, Radio, Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray
+from ccatp.errors import listed
 
 NOTHING = Known()
 LEAST_STEPS = 2

@@ -21,13 +21,13 @@ from ccatp.beacons.datasets.tables import (
     content_lines,
     delimiter_of,
     is_number,
-    listed,
     number,
     read_text,
     split_cells,
     tables_of,
 )
 from ccatp.core import FloatArray
+from ccatp.errors import listed
 
 LEAST_COLUMNS = 3  # of a table of readings
 QUATERNION = ("qx", "qy", "qz", "qw")

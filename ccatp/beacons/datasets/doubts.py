@@ -10,13 +10,14 @@ from scipy.stats import binom, chi2
 from ccatp.beacons.cricket.map_fit import map_rms_m
 from ccatp.beacons.datasets.checks import STRANGER_M
 from ccatp.beacons.datasets.mounting import robust_fit
-from ccatp.beacons.datasets.tables import instant, listed
+from ccatp.beacons.datasets.tables import instant
 from ccatp.beacons.estimation.predictions import place_by_ranges
 from ccatp.beacons.estimation.range_noise import correlations
 from ccatp.beacons.estimation.recording import EstimatedPath, KnownMap, RecordedRun
 from ccatp.beacons.estimation.track_review import range_residuals
 from ccatp.beacons.rigid_motion import aligned_rms_m
 from ccatp.core import FloatArray
+from ccatp.errors import listed
 
 LEAST_BEACONS = 3  # of which most are as they should be
 MISSED = 5.0  # times the expected difference of map and survey, above which one of them is wrong

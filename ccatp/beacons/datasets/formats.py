@@ -12,7 +12,6 @@ from ccatp.beacons.datasets.tables import (
     RadioDataError,
     Table,
     content_lines,
-    listed,
     plural,
     read_table,
     read_text,
@@ -21,6 +20,7 @@ from ccatp.beacons.datasets.tables import (
 )
 from ccatp.config.files import read_input
 from ccatp.core import FloatArray
+from ccatp.errors import listed
 
 
 def _plain_or_gzipped(folder: Path, name: str) -> Path | None:

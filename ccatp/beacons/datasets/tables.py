@@ -56,11 +56,6 @@ def plural(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """``6, 7, 8``, shortened if there are more than ``most``."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
 def read_text(file: Path, wanted: str = "a recording as text, or a ROS bag") -> str:
     """The text of a file: UTF-8, UTF-16 with its mark, or Windows-1252; a gzipped file, of any name, is unpacked.
 

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.datasets.events import READING_KINDS, Recording
-from ccatp.beacons.datasets.tables import RadioDataError, Table, listed
+from ccatp.beacons.datasets.tables import RadioDataError, Table
+from ccatp.errors import listed
 
 MOST_TAGS = 16  # more names are no tags
 TAG = 3  # column of the tag in a table of readings, if it has one
