@@ -47,6 +47,7 @@ from ccatp.beacons.estimation.window import spread_by_priors
 from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.beacons.rigid_motion import best_motion
 from ccatp.core import FloatArray
+from ccatp.errors import counted
 
 SPACING_S = 0.5  # longest interval between poses without readings
 FAR_OFF = 4.0  # median of the squared normalised residuals above which it is used as softness of the first iterations
@@ -280,13 +281,18 @@ def _calibration(
 
 
 def _warnings(run: RecordedRun, start: Start, converged: bool) -> Iterator[str]:
+    doubts = dict[str, list[str]]()
     for k, name in enumerate(run.beacon_ids):
         seen = run.readings.where(run.readings.beacon == k)
         if not start.used[k] and np.isnan(seen.range_m).all() and np.isnan(seen.rssi_dbm).all():
-            yield f"beacon {name} could not be placed: bearings alone do not place a beacon, a range or level is needed"
+            why = "could not be placed: bearings alone do not place a beacon, a range or level is needed"
         elif not start.used[k]:
-            yield f"beacon {name} could not be placed: too few readings of it, or all from one place"
+            why = "could not be placed: too few readings, or all from one place"
         elif start.doubtful[k]:
-            yield f"beacon {name} may lie at its mirror image: the path determines its side too little"
+            why = "may lie at the mirror image: the path determines the side too little"
+        else:
+            continue
+        doubts.setdefault(why, []).append(name)
+    yield from (f"{counted('beacon', names)} {why}" for why, names in doubts.items())
     if not converged:
         yield f"the smoother stopped after {ITERATIONS} iterations before it had converged"

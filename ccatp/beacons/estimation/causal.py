@@ -31,6 +31,7 @@ from ccatp.beacons.estimation.recording import (
 from ccatp.beacons.estimation.window import Window, excesses
 from ccatp.beacons.filters.ekf_slam import columns_of
 from ccatp.core import FloatArray
+from ccatp.errors import counted
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported
 BOTH_SCALES = ("distance_scale", "range_scale")
@@ -314,10 +315,12 @@ def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) 
 def _unplaced(run: RecordedRun, slam: BeaconSlam) -> Iterator[str]:
     r = run.readings
     ranged = {run.beacon_ids[k] for k in np.unique(r.beacon[np.isfinite(r.range_m) | np.isfinite(r.rssi_dbm)])}
-    whys = ("only bearings of it were received, no range", "its readings leave two places or none")
-    for name in run.beacon_ids:
-        if name not in slam.beacons:
-            yield f"beacon {name} could not be placed: {whys[name in ranged]}"
+    lost = [name for name in run.beacon_ids if name not in slam.beacons]
+    whys = {
+        "only bearings were received, no range": [name for name in lost if name not in ranged],
+        "the readings leave two places or none": [name for name in lost if name in ranged],
+    }
+    yield from (f"{counted('beacon', names)} could not be placed: {why}" for why, names in whys.items() if names)
     if slam.unplaced:
         early = f"{slam.unplaced} bearings had no range or strength of the same time"
         yield f"{early} and came before their beacon was placed"

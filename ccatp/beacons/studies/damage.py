@@ -275,6 +275,19 @@ def _undamaged(
     return run, track, judge(track, run)
 
 
+def new_warnings(warned: Sequence[str], before: Sequence[str]) -> list[str]:
+    """Those that say more than the ones ``before``, apart from numbers and from beacons that are no longer named."""
+    said = {part for line in before for part in _parts(line)}
+    return [line for line in warned if not said.issuperset(_parts(line))]
+
+
+def _parts(line: str) -> list[str]:
+    """A warning without its numbers, once for each of the beacons at its beginning."""
+    if shared := re.match(r"beacons? ((?:[^ ,]+, )*[^ ,]+) (could not be placed|may lie)", line):
+        return [f"{name} {shared[2]}" for name in shared[1].split(", ")]
+    return [re.sub(r"(?<!beacon )(?<!beacons )\d+(\.\d+)?", "#", line)]
+
+
 def run_damage(job: Job) -> JobOutcome:
     """Run the estimator on one damaged window; its outcome is one of ``OUTCOMES``."""
     cfg, kind, case = job.cfg, str(job.factors["damage"]), job.seed % len(cases_of(job.cfg.run.data))
@@ -303,9 +316,8 @@ def run_damage(job: Job) -> JobOutcome:
         found = estimate(replace(again, truth=None), cfg, estimator)
     except (RadioDataError, EstimateError) as error:
         return JobOutcome(values | {"outcome": "reported", "unsurveyed": "reported", "new": [str(error)]})
-    said = {_unnumbered(line) for line in (*run.warnings, *track.warnings)}
     warned = [line for line in (*again.warnings, *found.warnings) if not any(part in line for part in _NO_ALARM)]
-    new = [line for line in warned if _unnumbered(line) not in said]
+    new = new_warnings(warned, (*run.warnings, *track.warnings))
     after = judge(found, again)
     pairs = ((after.trajectory_rmse_m, before.trajectory_rmse_m), (after.beacon_rmse_m, before.beacon_rmse_m))
     is_near = all(late is None or late <= _NEAR * (early or 0.0) + _NEAR_M for late, early in pairs)
@@ -316,10 +328,6 @@ def run_damage(job: Job) -> JobOutcome:
     unsurveyed = silent if all("survey" in line for line in new) else outcome
     errors = {"path_m": after.trajectory_rmse_m, "beacons_m": after.beacon_rmse_m}
     return JobOutcome(values | errors | {"outcome": outcome, "unsurveyed": unsurveyed, "new": new})
-
-
-def _unnumbered(line: str) -> str:
-    return re.sub(r"(?<!beacon )(?<!beacons )\d+(\.\d+)?", "#", line)
 
 
 def _covers(track: EstimatedPath, run: RecordedRun, judged: TrackEvaluation) -> bool:

@@ -144,7 +144,7 @@ def test_a_beacon_with_bearings_only_is_reported_as_such() -> None:
     run = recorded(world(3, 20.0))
     blind = run.readings._replace(range_m=np.full(len(run.readings.times_s), np.nan))
     reported = track_of(replace(run, readings=blind)).warnings
-    assert "beacon 6 could not be placed: only bearings of it were received, no range" in reported
+    assert "beacons 6, 7, 8, 9 could not be placed: only bearings were received, no range" in reported
 
 
 def test_beacons_that_are_exchanged_on_the_way_are_reported() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.estimation.evaluation import judge
-from ccatp.beacons.estimation.recording import KnownMap, RecordedRun
+from ccatp.beacons.estimation.recording import KnownMap, Readings, RecordedRun
 from ccatp.beacons.studies.recordings import FILTERS, estimate
 from ccatp.beacons.studies.trait_runs import trait_run
 
@@ -57,3 +57,16 @@ def test_a_beacon_that_is_not_where_it_was_surveyed_is_placed_again(name: str) -
     assert off_m < 0.5
     if name != "smoother":
         assert any("beacon b0 was placed again" in line for line in track.warnings)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_beacons_that_cannot_be_placed_share_one_line(name: str) -> None:
+    run = trait_run((), 1)
+    names = (*run.beacon_ids, *(f"x{k}" for k in range(20)))
+    first = run.readings.where(np.zeros(20, dtype=np.intp))
+    once = first._replace(beacon=len(run.beacon_ids) + np.arange(20))
+    strangers = Readings(*(np.concatenate(pair) for pair in zip(once[:5], run.readings[:5], strict=True)))
+    run = replace(run, readings=strangers, beacon_ids=names, beacon_truth_m={})
+    lines = [line for line in estimate(run, CFG, name).warnings if "could not be placed" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("beacons x0, x1, x2, x3, x4, x5, x6, x7 and 12 more could not be placed: ")

@@ -13,7 +13,7 @@ from ccatp.beacons.cricket.mote_map import MoteMap, map_motes
 from ccatp.beacons.estimation.motion import Steering
 from ccatp.beacons.studies import cricket_study, mote_runs
 from ccatp.beacons.studies.cricket_study import combine, run_job
-from ccatp.beacons.studies.damage import DAMAGES, Damage, run_damage
+from ccatp.beacons.studies.damage import DAMAGES, Damage, new_warnings, run_damage
 from ccatp.beacons.studies.damage import STUDY as DAMAGE
 from ccatp.beacons.studies.gtsam_peer import PeerGaveUp
 from ccatp.beacons.studies.mote_navigation import combine as mote_navigation_combine
@@ -176,6 +176,13 @@ def test_a_damage_leaves_this_time(name: str, kind: str, longest_s: float, span_
     times_s = DAMAGES[name](undamaged).tables[kind].values[:, 0]
     assert np.diff(times_s).max() <= longest_s
     assert np.ptp(times_s) == pytest.approx(span_s, abs=4.0)
+
+
+def test_a_warning_is_new_if_it_names_another_beacon_or_says_something_else() -> None:
+    before = ["beacons 3, 5 could not be placed: too few", "12 of 40 readings were refused"]
+    of_both = "beacons 5, 6 could not be placed: too few"
+    known = ["beacon 5 could not be placed: too few", "14 of 41 readings were refused"]
+    assert new_warnings([*known, of_both, "the pose was uncertain"], before) == [of_both, "the pose was uncertain"]
 
 
 def test_the_survey_of_a_moved_or_exchanged_beacon_follows(undamaged: Damage) -> None:
