@@ -19,15 +19,8 @@ from ccatp.beacons.config.models import (
     RecordingConfig,
     SlamFilterConfig,
 )
-from ccatp.beacons.estimation.batch_problem import (
-    BEACON,
-    HEIGHT,
-    RSSI_REFERENCE,
-    SHARED,
-    BatchProblem,
-    BatchState,
-    PlacePrior,
-)
+from ccatp.beacons.estimation.batch_problem import BatchProblem
+from ccatp.beacons.estimation.batch_unknowns import BEACON, HEIGHT, RSSI_REFERENCE, SHARED, BatchState, PlacePrior
 from ccatp.beacons.estimation.causal import Followed, beyond_priors, follow
 from ccatp.beacons.estimation.evaluation import aligned_beacons
 from ccatp.beacons.estimation.landmark_init import LEAST

@@ -5,7 +5,8 @@ from copy import copy
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
-from ccatp.beacons.estimation.batch_problem import ArrowSystem, BatchProblem, BatchState
+from ccatp.beacons.estimation.batch_problem import ArrowSystem, BatchProblem
+from ccatp.beacons.estimation.batch_unknowns import BatchState
 from ccatp.beacons.estimation.motion import POSE
 from ccatp.core import FloatArray
 

@@ -16,9 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.config.models import OdometryNoiseConfig
-from ccatp.beacons.estimation.batch_problem import CALIBRATION, BatchProblem, BatchState
+from ccatp.beacons.estimation.batch_problem import BatchProblem
+from ccatp.beacons.estimation.batch_unknowns import BatchState
 from ccatp.beacons.estimation.least_squares import Factored
 from ccatp.beacons.estimation.motion import POSE, scaled_noise
+from ccatp.beacons.estimation.reckoning import CALIBRATION
 from ccatp.core import FloatArray
 
 ASSUMED = 10.0  # number of independent errors of odometry for which the configured noise counts

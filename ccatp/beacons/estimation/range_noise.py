@@ -4,7 +4,8 @@ from math import log
 
 import numpy as np
 
-from ccatp.beacons.estimation.batch_problem import BatchProblem, BatchState, BeaconNoise
+from ccatp.beacons.estimation.batch_problem import BatchProblem, BeaconNoise
+from ccatp.beacons.estimation.batch_unknowns import BatchState
 from ccatp.beacons.estimation.measurement_models import range_variance
 from ccatp.core import FloatArray
 

@@ -15,14 +15,12 @@ import numpy as np
 from scipy.linalg import LinAlgError
 
 from ccatp.beacons.config.models import FixedLagConfig, PriorsConfig, RecordingConfig, SlamFilterConfig
-from ccatp.beacons.estimation.batch_problem import (
+from ccatp.beacons.estimation.batch_problem import BatchProblem, BeaconNoise
+from ccatp.beacons.estimation.batch_unknowns import (
     BEACON,
-    CALIBRATION,
     HEIGHT,
     SHARED,
-    BatchProblem,
     BatchState,
-    BeaconNoise,
     MarginalPrior,
     PlacePrior,
     of_priors,
@@ -33,6 +31,7 @@ from ccatp.beacons.estimation.measurement_models import ANTENNA, HEIGHT_M2
 from ccatp.beacons.estimation.motion import POSE
 from ccatp.beacons.estimation.odometry_noise import OdometryNoise, odometry_noise
 from ccatp.beacons.estimation.range_noise import range_noise
+from ccatp.beacons.estimation.reckoning import CALIBRATION
 from ccatp.beacons.estimation.recording import (
     BeaconId,
     BoolArray,

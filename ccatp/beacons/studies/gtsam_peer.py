@@ -14,8 +14,8 @@ import numpy as np
 
 from ccatp.beacons.config.models import RecordingConfig
 from ccatp.beacons.cricket.trilateration import trilaterate
-from ccatp.beacons.estimation.batch_problem import CALIBRATION, Reckoning
 from ccatp.beacons.estimation.measurement_models import range_variance
+from ccatp.beacons.estimation.reckoning import CALIBRATION, Reckoning
 from ccatp.beacons.estimation.recording import BeaconFix, EstimatedPath, RecordedRun
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus

@@ -10,18 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import OdometryNoiseConfig, PriorsConfig, RadioNoiseConfig, RecordingConfig
-from ccatp.beacons.estimation.batch_problem import (
-    BEACON,
-    CALIBRATION,
-    SHARED,
-    BatchProblem,
-    BatchState,
-    Reckoning,
-    repeats,
-)
+from ccatp.beacons.estimation.batch_problem import BatchProblem, repeats
 from ccatp.beacons.estimation.batch_smoother import smooth
+from ccatp.beacons.estimation.batch_unknowns import BEACON, SHARED, BatchState
 from ccatp.beacons.estimation.evaluation import judge, truth_at
 from ccatp.beacons.estimation.least_squares import Factored, t_cost, t_weights
+from ccatp.beacons.estimation.reckoning import CALIBRATION, Reckoning
 from ccatp.beacons.estimation.recording import (
     BeaconFix,
     EstimatedPath,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
-from ccatp.beacons.estimation.batch_problem import BEACON, SHARED, BatchProblem, BatchState
+from ccatp.beacons.estimation.batch_problem import BatchProblem
+from ccatp.beacons.estimation.batch_unknowns import BEACON, SHARED, BatchState
 from ccatp.beacons.estimation.evaluation import truth_at
 from ccatp.beacons.estimation.least_squares import Factored, descend
 from ccatp.beacons.estimation.odometry_noise import MOST, OdometryNoise, odometry_noise

@@ -8,7 +8,8 @@ import pytest
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.mounting import misplaced_radios
-from ccatp.beacons.estimation.batch_problem import BEACON, SHARED, BatchProblem, BatchState
+from ccatp.beacons.estimation.batch_problem import BatchProblem
+from ccatp.beacons.estimation.batch_unknowns import BEACON, SHARED, BatchState
 from ccatp.beacons.estimation.evaluation import judge, truth_at
 from ccatp.beacons.estimation.motion import RadioPose
 from ccatp.beacons.estimation.recording import KnownMap, Radio, RecordedRun

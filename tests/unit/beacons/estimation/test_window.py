@@ -8,8 +8,9 @@ import pytest
 
 from ccatp.beacons.config.load import load_recordings_config
 from ccatp.beacons.config.models import FixedLagConfig
-from ccatp.beacons.estimation.batch_problem import BEACON, SHARED, BatchState, BeaconNoise, MarginalPrior
+from ccatp.beacons.estimation.batch_problem import BeaconNoise
 from ccatp.beacons.estimation.batch_smoother import smooth
+from ccatp.beacons.estimation.batch_unknowns import BEACON, SHARED, BatchState, MarginalPrior
 from ccatp.beacons.estimation.causal import filter_run, follow
 from ccatp.beacons.estimation.evaluation import judge, truth_at
 from ccatp.beacons.estimation.least_squares import Factored, eliminated
