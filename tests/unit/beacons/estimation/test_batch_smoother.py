@@ -357,7 +357,8 @@ def test_a_straight_path_leaves_the_side_in_doubt() -> None:
     ranges = np.hypot(places[:, 0] - sx, places[:, 1] - 1.0)
     straight = changed(w, poses=poses, distance_m=np.full(n, 0.05), turn_rad=np.zeros(n), range_m=ranges)
     track = smooth(recorded(straight, bearings=False), SETTINGS, HOW, no_clock)
-    assert "beacon 7 may lie at its mirror image" in " ".join(track.warnings)
+    (doubt,) = (line for line in track.warnings if "may lie at the mirror image" in line)
+    assert "7" in doubt.split(" may ")[0]
 
 
 def test_a_robot_that_stands_places_no_beacon() -> None:
@@ -369,7 +370,7 @@ def test_a_robot_that_stands_places_no_beacon() -> None:
     track = smooth(recorded(stood, bearings=False), SETTINGS, HOW, no_clock)
     assert track.beacons == {}
     assert np.isfinite(track.covariances).all()
-    assert sum("or all from one place" in warning for warning in track.warnings) == len(BEACONS)
+    assert "beacons 6, 7, 8, 9 could not be placed: too few readings, or all from one place" in track.warnings
 
 
 # -- figures of a run --------------------------------------------------------------------------------------------------
