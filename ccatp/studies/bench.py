@@ -1,12 +1,8 @@
 """Benchmarks: each case of a table timed alternately with its peers, timed missions, and the result as text."""
 
 import gc
-import os
-import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +13,12 @@ from ccatp.core import FloatArray
 from ccatp.report.html import render
 from ccatp.studies.bench_cases import STEPS, Contender, races
 from ccatp.studies.bench_frame import BenchError, frame_cases
+from ccatp.studies.machine import machine, machine_line
 
 EQUAL_WITHIN = 1e-10  # every entry of mean and covariance, SI units
 ROUNDS, QUICK_ROUNDS = 40, 4
 MOST_DENSE_ROUNDS = 10
 FRAMES_OF_RESULT = ("mission in process", "lockstep")
-PACKAGES = ("ccatp", "numpy", "scipy", "filterpy", "stonesoup")
-CPU_INFO = Path("/proc/cpuinfo")
 
 
 def run_bench(
@@ -118,22 +113,6 @@ def largest_difference(ours: Contender, peer: Contender) -> float:
     return largest
 
 
-def machine() -> dict[str, object]:
-    """Processor, usable cores, versions of Python and the packages, threads of the linear algebra."""
-    cpu, cores = platform.processor() or platform.machine(), os.cpu_count() or 1
-    with suppress(OSError):  # the kernel's name of the model
-        lines = [line.partition(":") for line in CPU_INFO.read_text(encoding="utf-8").splitlines()]
-        cpu = next((model.strip() for name, _, model in lines if name.strip() == "model name"), cpu)
-    with suppress(AttributeError):  # not on every system
-        cores = len(os.sched_getaffinity(0))
-    versions: dict[str, str | None] = dict.fromkeys(PACKAGES)
-    for name in PACKAGES:
-        with suppress(PackageNotFoundError):
-            versions[name] = version(name)
-    blas_threads = os.environ.get("OPENBLAS_NUM_THREADS")
-    return {"cpu": cpu, "cores": cores, "python": platform.python_version(), **versions, "blas_threads": blas_threads}
-
-
 BY_HAND = "<!-- by hand -->\n"
 
 
@@ -176,9 +155,3 @@ def result_lines(frames: Sequence[Mapping[str, Any]], steps: Sequence[Mapping[st
 
 def _span(values: Sequence[float]) -> str:
     return " to ".join(dict.fromkeys(f"{value:.2f}" for value in (min(values), max(values))))
-
-
-def machine_line(machine: Mapping[str, Any]) -> str:
-    """The machine in one line."""
-    packages = [f"{name} {machine[name]}" for name in PACKAGES[1:] if machine[name]]
-    return ", ".join([machine["cpu"], f"{machine['cores']} cores", f"Python {machine['python']}", *packages])

@@ -278,8 +278,17 @@ class SilRun:
         robot.join("controller")
         frame = self._receive()
         self.begin_drives()
-        first_s = t_s = self._time.at(frame.seq, frame.t)
-        last_s = first_s - robot.frame_s
+        first_s = self._time.at(frame.seq, frame.t)
+        return self._run_from(frame, first_s, first_s - robot.frame_s)
+
+    def _run_from(self, frame: Sensors, first_s: float, last_s: float) -> SilResult:
+        """From a frame on, which was received and not served yet.
+
+        Args:
+            frame: the frame.
+            first_s, last_s: times of the first frame of the mission, and of the one before this.
+        """
+        robot, t_s = self.robot, last_s
         limit_s = _ENDLESS * self.parts.lower_bound_s + 600.0
         while self.mission.state.mode is not DONE:  # a subclass may exchange it
             is_new = frame.seq > self.monitor.verdict.seq

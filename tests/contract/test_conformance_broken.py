@@ -40,10 +40,12 @@ def judge(
     assert not wrong, json.dumps(wrong, indent=1)
 
 
-# Further units of one quantity: as the first one, a factor beyond the limits of its check.
+# Further units, signs and sides of one quantity: as the first one, beyond the limits of its check.
 FURTHER = {
-    "encoders in degrees", "encoders in turns per second", "encoders of the motor's shaft", "drives taken for degrees",
-    "gyroscope in turns per second", "gyroscope that is dead", "accelerometer in mm/s2", "accelerometer that is dead",
+    "encoders in degrees", "encoders in rpm", "encoders in turns per second", "encoders of the motor's shaft",
+    "encoders of the other sign", "left encoder that is dead", "drives taken for degrees", "diameter for the radius",
+    "wheels reversed, encoders too", "gyroscope in degrees", "gyroscope in turns per second", "gyroscope that is dead",
+    "accelerometer in g", "accelerometer in mm/s2", "accelerometer that is dead",
 }  # fmt: skip
 FIRST_UNITS = [broken for broken in QUANTITIES if broken.name not in FURTHER]
 FURTHER_UNITS = [broken for broken in QUANTITIES if broken.name in FURTHER]

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from ccatp.commissioning.conformance.runner import check_ids
 from ccatp.conditions import find_condition
 from ccatp.core import Severity as Level
-from ccatp.studies.bench import machine
+from ccatp.studies.machine import machine
 
 PATH = Path(__file__).with_name("table.toml")
 # Rows of each kind in the list that the project works from; a row may be added, none may be lost.

@@ -1,6 +1,7 @@
 """Faults of sensors, wheels, battery and fans: each is injected, real at the robot and answered in time."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import pairwise
 from math import hypot, inf
 from statistics import mean
@@ -20,7 +21,7 @@ from ccatp.survey.events import Mode, SurveyOutcome
 from tests.faults.linking import Measured
 from tests.support.cases import slow_case
 from tests.support.scenario import config_of, one_panel
-from tests.support.sim_survey import Seen, Watched, watched
+from tests.support.sim_survey import Enough, Seen, Watched, plan_of, watched
 
 # Of the first seconds of a short survey in the hard world with seed 1: see ``test_the_times_are_what_they_are_called``.
 DRIVING_S, BRAKING_S, TURNING_S, STANDING_S = 7.5, 8.9, 3.7, 9.6
@@ -96,6 +97,16 @@ def test_the_times_are_what_they_are_called() -> None:
     assert at[TURNING_S].state is Mode.TURNING
     assert at[STANDING_S].is_zero
     assert all(one.verdict.severity is Severity.NONE for one in run.since(0.1))
+
+
+def test_a_copied_mission_is_the_whole_one() -> None:
+    fault = f"encoder_left garbage at_s={DRIVING_S} for_s=0.05 beyond=0.0"  # of random numbers
+    copied, whole = watched(HARD, after(10.0), fault), Watched(HARD, plan_of(fault), after(10.0))
+    with suppress(Enough):
+        whole.run()
+    places = [[(one.pose, one.estimate, one.drive) for one in run.seen] for run in (copied, whole)]
+    assert places[0] == places[1]
+    assert [record.changed for record in copied.injected] == [record.changed for record in whole.injected]
 
 
 # -- the wheels are commanded to stand ----------------------------------------------------------------------------

@@ -70,24 +70,24 @@ RESTARTS = """
 [[fault]]
 signal = "robot"
 type = "reboot"
-at_s = 25.0
+at_s = 10.0
 
 [[fault]]
 signal = "clock"
 type = "jump"
-at_s = 40.0
+at_s = 18.0
 by_s = -5.0
 
 [[fault]]
 signal = "clock"
 type = "wrap"
-at_s = 60.0
-modulo_s = 30.0
+at_s = 26.0
+modulo_s = 12.0
 
 [[fault]]
 signal = "robot"
 type = "reboot"
-at_s = 70.0
+at_s = 32.0
 """
 
 
@@ -97,7 +97,7 @@ def test_a_run_with_restarts_and_steps_of_the_clock_is_read_as_it_was(
 ) -> None:
     plan = tmp_path / "plan.toml"
     plan.write_text(RESTARTS, encoding="utf-8")
-    run = start("--panels", "1", "--faults", str(plan), calibrates=True)
+    run = start("--panels", "1", "--faults", str(plan))
     assert run.wait() == 0, run.stderr
     status = main(["replay", str(run.run_dir), "--json"])
     printed = capsys.readouterr()

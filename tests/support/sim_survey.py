@@ -4,9 +4,10 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, wait
 from contextlib import asynccontextmanager, suppress
+from copy import deepcopy
 from dataclasses import dataclass
 from itertools import pairwise
-from math import hypot
+from math import floor, hypot
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeVar, cast
@@ -26,6 +27,7 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.records.store import MissionStore, StoredPoint
+from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import Checkpoint, SurveyParts, take_over
@@ -73,7 +75,7 @@ class Seen(NamedTuple):
         return self.drive == (0.0, 0.0)
 
 
-class _Enough(Exception):
+class Enough(Exception):
     """Seen what was to be seen."""
 
 
@@ -84,9 +86,21 @@ class Watched(SilRun):
         super().__init__(cfg, plan)
         self.seen: list[Seen] = []
         self._is_enough = is_enough
+        self._last_s = 0.0
+
+    def go_on(self, plan: FaultPlan, is_enough: Callable[[Seen], bool]) -> None:
+        """From where it has seen enough, with the robot's faults of a plan, all of which are later."""
+        rng = np.random.default_rng(self.cfg.run.seed).spawn(3)[2]  # that of the robot's injector
+        self.robot.injector = injector = Injector(plan, self.mirror, rng)
+        assert not injector.drifts
+        assert all(fault.signal != "laser" for fault in plan.faults)
+        self._is_enough = is_enough
+        self.robot.advance()
+        self._run_from(self._receive(), 0.0, self._last_s)
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         super()._serve(frame, dt_s)
+        self._last_s = frame.t + self._time.offset_s
         deck, robot = self.localizer.deck_pose, self.robot
         place = robot.world.plant.pose
         verdict, estimate = self.monitor.verdict, (deck.x_m, deck.y_m)
@@ -94,7 +108,7 @@ class Watched(SilRun):
         now = Seen(robot.t_s, verdict, self.mission.state.mode, drive, place, estimate)
         self.seen.append(now)
         if self._is_enough(now):
-            raise _Enough
+            raise Enough
 
     def since(self, t_s: float) -> list[Seen]:
         return [one for one in self.seen if one.t_s >= t_s - 1e-9]
@@ -114,11 +128,35 @@ class Watched(SilRun):
         return sum(hypot(b.x_m - a.x_m, b.y_m - a.y_m) for a, b in pairwise(poses))
 
 
+_BEGUN: dict[tuple[int, float], Watched] = {}
+
+
+def begun(cfg: Config, t_s: float) -> Watched:
+    """A mission without a fault, so far; one for all that go on from there."""
+    key = id(cfg), t_s  # the mission keeps its configuration, so no other object has this id
+    if key not in _BEGUN:
+        _BEGUN[key] = run = Watched(cfg, NO_FAULTS, lambda one: one.t_s >= t_s)
+        with suppress(Enough):
+            run.run()
+    return _BEGUN[key]
+
+
 def watched(cfg: Config, is_enough: Callable[[Seen], bool], *faults: str) -> Watched:
-    """A watched mission with faults as of ``plan_of``; each of them really acted."""
-    run = Watched(cfg, plan_of(*faults), is_enough)
-    with suppress(_Enough):
-        run.run()
+    """A watched mission with faults as of ``plan_of``; each of them really acted.
+
+    Missions of one configuration are equal until the first fault: until the half second before it, of which the fault
+    may know the readings, they are computed once and copied.
+    """
+    plan = plan_of(*faults)
+    common_s = 0.5 * floor(2.0 * min((fault.at_s for fault in plan.faults), default=0.0)) - 0.5
+    with suppress(Enough):
+        if common_s > 1.0:
+            shared = begun(cfg, common_s)
+            run = deepcopy(shared, {id(one): one for one in (shared.cfg, shared.mirror)})
+            run.go_on(plan, is_enough)
+        else:
+            run = Watched(cfg, plan, is_enough)
+            run.run()
     assert all(record.samples and record.changed for record in run.injected), "a fault changed nothing"
     return run
 

@@ -33,7 +33,7 @@ from tests.support.scenario import config_of, mirror_of
 
 FRAME_S, SAMPLE_S = 0.01, 0.001
 BEGIN_S = 3.0  # until then the robot is sound: rates, noise and set points are learned
-LIMIT_S = 6.0  # instead of the configured ``hold_limit_s``
+LIMIT_S = 4.5  # instead of the configured ``hold_limit_s``
 HEALTH = config_of("fyst-m2", health__hold_limit_s=LIMIT_S).health
 
 

@@ -20,10 +20,11 @@ from ccatp.links.robot_messages import Drive, Sensors
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.robot import Robot
 from ccatp.studies import bench, bench_cases, bench_frame, calibrator
-from ccatp.studies.bench import machine, step_case
+from ccatp.studies.bench import step_case
 from ccatp.studies.bench_cases import Contender, races
 from ccatp.studies.bench_frame import BenchError, LockstepRun, Moment, ProcessUse
 from ccatp.studies.calibrator import BUSY, IDLE, LOADS, ONE_CORE, load
+from ccatp.studies.machine import machine
 
 STEPS = 10
 CFG = load_config()
@@ -160,7 +161,7 @@ def test_the_rows_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (in_process["times_real_time"], in_process["ratio"]) == (pytest.approx(20.0), pytest.approx(10.0))
     assert idle["name"].endswith("2 panels, idle")
     assert (cases[-1]["us_p50"], cases[-1]["us_p99"], cases[-1]["ratio"]) == (100.0, 200.0, pytest.approx(0.01))
-    result = {"machine": bench.machine(), "cases": cases}
+    result = {"machine": machine(), "cases": cases}
     table = [line for line in bench.tables(result).splitlines() if line.startswith("|")]
     assert len(table) == len(cases) + 2
     assert len({line.count("|") for line in table}) == 1

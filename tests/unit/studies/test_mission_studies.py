@@ -394,7 +394,7 @@ def has(cell: Any, key: str) -> bool:
 
 
 # The others share their code, or that of the missions with a rigid body, which take a quarter of a minute.
-SLOW = ("ablation", "bodies", "cricket", "physics", "sensitivity", "slides", "stops", "time")
+SLOW = ("ablation", "bodies", "cricket", "damage", "faults", "physics", "sensitivity", "slides", "stops", "time")
 
 
 @pytest.mark.parametrize(
