@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.faults.linking import Measured
+from tests.support.cases import slow_case
 from tools.gap_campaign import Cell, cells_of, table
 from tools.gap_rig import FILTERS, MOTORS, SILENT, WAYS, WORLDS, Drive, Way, run
 
@@ -29,7 +30,7 @@ def test_a_few_gaps_of_all_encoders(motors: str, measured: Measured) -> None:
 
 
 @ROW
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", ["hard", *(slow_case(world) for world in WORLDS if world != "hard")])
 def test_a_gap_that_begins_with_a_rest_moves_nothing(world: str) -> None:
     """With the ninth seed it begins in the frame after that in which the robot counts as resting."""
     way = Way("standstill", "ttl")

@@ -25,6 +25,7 @@ from ccatp.filters import FILTERS
 from ccatp.filters.base import Filter
 from ccatp.kinematics import wrap_pi
 from ccatp.mirror.mirror import Mirror
+from tests.support.cases import slow_case
 from tests.support.scenario import transport_rad
 from tests.support.slam_settings import odometry, settings, trust
 from tests.unit.estimation.drive import config, mirror
@@ -157,7 +158,7 @@ def test_errors_are_as_large_as_the_covariance_says(name: str) -> None:
             assert low < mean < high, (look, len(states))
 
 
-@pytest.mark.parametrize("name", ["ekf", "ukf"])
+@pytest.mark.parametrize("name", ["ekf", slow_case("ukf")])
 def test_fixes_are_as_far_off_as_expected(name: str) -> None:
     """Innovations of a filter that fits are white, so those of one robot count as those of three."""
     nis = np.array([run(name, seed).nis for seed in range(SEEDS)])

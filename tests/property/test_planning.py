@@ -170,7 +170,7 @@ def check_way_home(cfg: Config, mirror: Mirror, start: DeckPose) -> None:
     assert worst_sensor(cfg, mirror, legs) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
-@pytest.mark.parametrize("panels", [1, 2, 8, pytest.param(0, marks=pytest.mark.slow, id="whole")])
+@pytest.mark.parametrize("panels", [1, slow_case(2), 8, pytest.param(0, marks=pytest.mark.slow, id="whole")])
 @pytest.mark.parametrize("order", SURVEYS)
 @pytest.mark.parametrize("name", NAMES)
 def test_home_from_the_end_of_a_survey(name: str, order: str, panels: int) -> None:
@@ -193,7 +193,7 @@ def test_home_from_points(name: str, inner: int, rim: int) -> None:
             check_way_home(cfg, mirror, DeckPose(x, y, radians(37.0 * k)))
 
 
-@pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow, id="all")])
+@pytest.mark.parametrize("step", [6, pytest.param(1, marks=pytest.mark.slow, id="all")])
 @pytest.mark.parametrize("name", ONE_OF_EACH)
 def test_home_from_a_point_at_the_rim_without_a_sweep(name: str, step: int) -> None:
     """As a survey stands there, along the rim or across it, no sensor comes nearer to it than on a survey."""

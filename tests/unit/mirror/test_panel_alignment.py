@@ -45,6 +45,7 @@ from ccatp.mirror.panel_modes import (
 )
 from ccatp.records.recorder import TELEMETRY, Recorder, RobotClock
 from ccatp.sim.world import draw_misalignments
+from tests.support.cases import slow_case
 from tests.support.command import answered, printed
 from tests.support.recorded import make_run, record
 from tests.support.scenario import MIRRORS, World, config_of, world_of
@@ -253,7 +254,7 @@ def test_two_equal_outliers_that_a_bent_panel_explains_as_well_are_not_decided()
 
 
 @pytest.mark.parametrize(
-    ("first_m", "second_m", "most_wrong"), [(50e-6, 50e-6, 0), (50e-6, -50e-6, 1), (50e-6, 30e-6, 1)]
+    ("first_m", "second_m", "most_wrong"), [(50e-6, 50e-6, 0), (50e-6, -50e-6, 1), slow_case(50e-6, 30e-6, 1)]
 )
 def test_two_wrong_points_of_a_bent_panel_that_look_like_another_one_are_not_decided(
     first_m: float, second_m: float, most_wrong: int
@@ -344,7 +345,7 @@ def test_the_covariance_and_the_residuals_of_a_bent_panel_are_as_stated() -> Non
     assert np.mean(residuals) == pytest.approx(exact.residual_variance_m2, rel=0.15)
 
 
-@pytest.mark.parametrize("error_m", [50e-6, -200e-6])
+@pytest.mark.parametrize("error_m", [50e-6, slow_case(-200e-6)])
 def test_a_wrong_point_of_a_bent_panel_does_not_move_it(error_m: float) -> None:
     rng = np.random.default_rng(21)
     truth = fit_bent(on_grid(BENT), np.ones(9, dtype=np.bool_), rigid, half_size_m(M1.panel(TILTED)))
@@ -451,6 +452,7 @@ def true_rms_m(truth: Truth, panels: tuple[PanelResult, ...], mirror: Mirror) ->
     return float(np.sqrt(total / weights))
 
 
+@pytest.mark.parametrize("world", ["fyst-m2", "thesis-m1", *map(slow_case, ("fyst-m1", "thesis-m2"))], indirect=True)
 def test_a_whole_mirror_is_recovered_and_its_moves_align_it(world: World) -> None:
     cfg, mirror = world
     rng = np.random.default_rng(21)
@@ -525,7 +527,7 @@ def test_contradictions_beyond_outliers_are_reported() -> None:
     assert result.panels[0].fit.sigma[0] == pytest.approx(20e-6, rel=0.01)
 
 
-@pytest.mark.parametrize("rough_m", [20e-6, 28e-6])
+@pytest.mark.parametrize("rough_m", [20e-6, slow_case(28e-6)])
 def test_points_that_scatter_more_than_they_are_uncertain_have_larger_sigmas(rough_m: float) -> None:
     """Panels that are not smooth: no point of them is an outlier, and the moves are as uncertain as they are wrong."""
     rng = np.random.default_rng(6)

@@ -5,13 +5,14 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.escape import find_escape
 from ccatp.survey.planning.legs import build_body, build_places, sensor_depths
 from ccatp.survey.planning.search import SearchNode
+from tests.support.cases import slow_case
 from tests.support.scenario import config_of, mirror_of
 
 ALONG_RAD = np.radians([-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize("name", ["fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2"])
-@pytest.mark.parametrize("depth_m", [0.101, 0.102, 0.105, 0.11])
+@pytest.mark.parametrize("depth_m", [0.101, slow_case(0.102), 0.105, slow_case(0.11)])
 def test_a_robot_that_stands_beside_the_rim_gets_away_without_a_sensor_near_it(name: str, depth_m: float) -> None:
     """The lowest row of points is 0.106 m from the rim; a robot that stops 6 mm too low has room to turn for 7 deg."""
     cfg, mirror = config_of(name), mirror_of(name)
