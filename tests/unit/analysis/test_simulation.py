@@ -92,10 +92,10 @@ def test_a_fault_plan_acts_on_robot_and_laser(tmp_path_factory: pytest.TempPathF
 
 def test_a_laser_that_does_not_follow_ends_a_simulation_as_it_ends_a_run(tmp_path: Path) -> None:
     """The daemon's checks of a fix are made here, too: no point is measured where the robot is not."""
-    (tmp_path / "plan.toml").write_text('[[fault]]\nsignal = "laser"\ntype = "at_rest"\nat_s = 50.0\nfor_s = 20.0\n')
-    run = ccatp.simulate(panels=1, seed=1, faults=tmp_path / "plan.toml", keep_samples=False)
+    (tmp_path / "plan.toml").write_text('[[fault]]\nsignal = "laser"\ntype = "at_rest"\nat_s = 8.0\nfor_s = 20.0\n')
+    run = ccatp.simulate(panels=1, seed=1, faults=tmp_path / "plan.toml", settings=NO_DRIVE, keep_samples=False)
     measured = run.points[run.points["status"] == "measured"]
-    assert len(measured) == 1
+    assert len(measured) == 2
     assert float(measured["measured_at_mm"].max()) < 10.0
     assert run.findings.outcome.text == "ended with status 4, held"
     assert run.findings.outcome.cause.startswith(LASER_NOT_FOLLOWING.message.split("{")[0].strip())

@@ -350,7 +350,7 @@ FEW_STEPS = ("--set", "run.steps=300")
 # Choices of cells, further arguments, and the stems of all figures.
 RUNS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "thesis": (
-        ("noise=normal", "system=thesis", "noise_is_variance=True", "period_error=0.008"), ("--panels", "1"),
+        ("noise=normal", "system=thesis", "noise_is_variance=True", "period_error=0.008"), ONE_PANEL_ARGS,
         "trajectory_normal localization_normal waypoints_normal",
     ),
     "filters": (
