@@ -72,7 +72,9 @@ def is_point(m: LaserRequest, *numbers: int) -> bool:
     ("points", "times", "outcome", "measured", "skipped", "why"),
     [
         pytest.param((5,), 1, "complete", 9, 0, [], id="once: measured at the end"),
-        pytest.param((5,), 99, "complete", 8, 1, ["no reply"], id="twice: told with its reason"),
+        pytest.param(
+            (5,), 99, "complete", 8, 1, ["no reply"], id="twice: told with its reason", marks=pytest.mark.slow
+        ),
         pytest.param(range(1, 7), 99, "faulted", 3, 3, [], id="three in a row hold the mission"),
     ],
 )  # fmt: skip
@@ -304,7 +306,7 @@ def test_outliers_are_not_fused(name: str, tmp_path: Path, measured: Measured) -
 
 
 @pytest.mark.fault("E3")
-@pytest.mark.parametrize(("height_m", "is_taken"), [(0.0045, True), (-0.0055, False)])
+@pytest.mark.parametrize(("height_m", "is_taken"), [slow_case(0.0045, True), (-0.0055, False)])
 def test_a_puck_off_the_surface_is_refused(height_m: float, is_taken: bool, tmp_path: Path) -> None:
     mirror = mirror_of()
 

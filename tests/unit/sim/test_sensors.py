@@ -26,6 +26,7 @@ from ccatp.sim.sensors import (
     draw_rectangles,
     sample_times,
 )
+from tests.support.cases import slow_case
 
 OFFSETS = ((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09))
 DT_S = 0.01
@@ -176,7 +177,7 @@ def test_material_is_inside_the_shifted_edges_and_nowhere_else(config: Config) -
     assert not sensors.is_on(99.0, 0.0)
 
 
-@pytest.mark.parametrize("is_shifted", [True, False])
+@pytest.mark.parametrize("is_shifted", [True, slow_case(False)])
 @pytest.mark.parametrize("seed", [0])
 def test_sensors_see_the_edges_at_every_millisecond(config: Config, seed: int, is_shifted: bool) -> None:
     """Against the plain question asked at each sample, along drives and turns across seams and over the rim."""
@@ -234,7 +235,7 @@ def orders(frames: int) -> list[tuple[float, float]]:
     return found[:frames]
 
 
-@pytest.mark.parametrize("hz", [1000.0, 333.0])
+@pytest.mark.parametrize("hz", [slow_case(1000.0), 333.0])
 def test_the_sum_of_the_rates_is_the_counted_angle(config: Config, mirror: Mirror, hz: float) -> None:
     world = world_of(config, encoder_counts_per_rev=COUNTS)
     plant, encoders = plant_on_deck(mirror), CountingEncoders(world, hz, DT_S, np.random.default_rng(2))
