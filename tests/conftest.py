@@ -2,7 +2,6 @@
 
 import gc
 import inspect
-import os
 import signal
 import socket
 import tempfile
@@ -16,7 +15,7 @@ from hypothesis import settings
 
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
-from tests.support.leaks import no_new_tasks
+from tests.support.leaks import child_processes, command_of, no_new_tasks
 from tests.support.runs import RecordedRun, record_once
 from tests.support.scenario import config_of, mirror_of
 from tests.support.temporary import session_folder
@@ -75,12 +74,12 @@ def own_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def nothing_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail a test that leaves a child process or an asyncio task behind."""
-    before = _children()
+    before = child_processes()
     if inspect.iscoroutinefunction(getattr(request.function, "__wrapped__", request.function)):
         request.getfixturevalue("no_task_leaks")
     yield
-    if leaked := _children() - before:
-        shown = ", ".join(_describe(child) for child in leaked)
+    if leaked := child_processes() - before:
+        shown = ", ".join(command_of(child) for child in leaked)
         _, alive = psutil.wait_procs(leaked, timeout=GRACE_S)
         if alive:
             alive += [below for child in alive for below in child.children(recursive=True)]
@@ -95,29 +94,6 @@ async def no_task_leaks() -> AsyncIterator[None]:
     """Fail when tasks are left in the event loop of the test. Set up for each asyncio test."""
     async with no_new_tasks():
         yield
-
-
-def _children() -> set[psutil.Process]:
-    """Child processes of this one; multiprocessing keeps one helper of its own for good.
-
-    Those below them are theirs: a browser that several tests share starts processes when it likes.
-    """
-    try:
-        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-    except ChildProcessError:  # there are none, which is quicker to find out than to look at all processes
-        return set()
-    return {
-        child
-        for child in psutil.Process(os.getpid()).children()
-        if "multiprocessing.resource_tracker" not in _describe(child)
-    }
-
-
-def _describe(child: psutil.Process) -> str:
-    try:
-        return f"{child.pid} {' '.join(child.cmdline()) or child.name()}"
-    except psutil.Error:  # it ended in between
-        return str(child.pid)
 
 
 @pytest.fixture

@@ -6,15 +6,16 @@ import subprocess
 import threading
 import time
 from collections.abc import Sequence
+from multiprocessing import resource_tracker
 from pathlib import Path
 
-import psutil
 import pytest
 
 from ccatp.daemon.operator.report_process import ReportProcess, by_hand, written
 from ccatp.daemon.supervision.fork_server import ChildProcess, start_module
 from ccatp.daemon.supervision.process import open_log
 from ccatp.records.run_reader import RunReadError
+from tests.support.leaks import child_processes
 from tests.support.recorded import make_run, record_beacons
 from tests.support.scenario import world_of
 
@@ -31,7 +32,7 @@ def test_a_run_gets_its_report_and_the_process_ends(tmp_path: Path) -> None:
     for one, text in ((run_dir, "<!DOCTYPE html>"), (record_beacons(tmp_path / "beacons"), "among ZigBee beacons")):
         with ReportProcess(start_module, one) as drawing:
             drawing.begin()
-            (process,) = psutil.Process().children()
+            (process,) = child_processes()
             assert not (one / "report.html").exists()
             assert drawing.write(log) == str(one / "report.html")
         assert text in (one / "report.html").read_text()
@@ -41,13 +42,14 @@ def test_a_run_gets_its_report_and_the_process_ends(tmp_path: Path) -> None:
 
 def test_without_a_request_there_is_no_process_and_no_report(tmp_path: Path) -> None:
     run_dir = empty_run(tmp_path / "run")
+    resource_tracker.ensure_running()  # as after tests that use multiprocessing; it is nobody's report
     with ReportProcess(start_module, run_dir):
-        assert psutil.Process().children() == []
+        assert child_processes() == set()
     with ReportProcess(start_module, run_dir) as drawing:
         drawing.begin()
         drawing.begin()
-        assert len(psutil.Process().children()) == 1
-    assert psutil.Process().children() == []
+        assert len(child_processes()) == 1
+    assert child_processes() == set()
     assert not (run_dir / "report.html").exists()
 
 
@@ -56,7 +58,7 @@ def test_the_death_of_the_process_is_logged_and_the_report_is_made_by_hand(tmp_p
     log = open_log(run_dir / "log.jsonl", "supervisor")
     with ReportProcess(start_module, run_dir) as drawing:
         drawing.begin()
-        psutil.Process().children()[0].kill()
+        child_processes().pop().kill()
         assert drawing.write(log) == by_hand(run_dir) == f"none; make it with: ccatp report {run_dir}"
 
     def refuse(_module: str, _arguments: Sequence[str], _fds: Sequence[int]) -> ChildProcess:
@@ -85,7 +87,7 @@ def test_a_signal_ends_only_the_writing(tmp_path: Path) -> None:
         assert drawing.write(log) == by_hand(run_dir)
         interrupter.join()
     assert signal.getsignal(signal.SIGTERM) is before
-    assert psutil.Process().children() == []
+    assert child_processes() == set()
     assert (run_dir / "log.jsonl").read_text() == ""
 
 
