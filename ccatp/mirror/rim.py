@@ -146,16 +146,20 @@ class Rim(Outline):
         if beyond > _CLEARANCE_TOLERANCE_M:
             return -beyond
         a, b = (x0, y0), (x1, y1)
-        # Two segments that do not cross are nearest to each other at one of their ends.
-        return min(
-            min(
-                to_segment_m(a, c, d),
-                to_segment_m(b, c, d),
-                to_segment_m(c, a, b),
-                to_segment_m(d, a, b),
-            )
-            for c, d in self._edges
-        )
+        left, right = (x0, x1) if x0 < x1 else (x1, x0)
+        low, high = (y0, y1) if y0 < y1 else (y1, y0)
+        least = limit = inf
+        # Two segments that do not cross are nearest to each other at one of their ends; the end of an edge is the
+        # beginning of the next one. Edges are upright or level, so most are told to be too far by one coordinate.
+        for c, d in self._edges:
+            if c[0] == d[0]:
+                if c[0] - right > limit or left - c[0] > limit:
+                    continue
+            elif c[1] - high > limit or low - c[1] > limit:
+                continue
+            least = min(least, to_segment_m(a, c, d), to_segment_m(b, c, d), to_segment_m(c, a, b))
+            limit = least + _CLEARANCE_TOLERANCE_M  # far above the rounding of a distance
+        return least
 
     def _largest_excess_m(self, x0: float, y0: float, x1: float, y1: float) -> float:
         """Largest distance of a point of the segment from the mirror, 0 on it, by branch and bound.
