@@ -22,6 +22,7 @@ from ccatp.conditions import (
     all_conditions,
 )
 from ccatp.conditions.danger import SAMPLE_RATES
+from ccatp.config.files import write_durably
 from ccatp.config.robot_limits import LIMITS
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervision.supervisor import PROCESSES
@@ -242,10 +243,10 @@ def pages() -> dict[Path, str]:
 
 
 def main() -> None:
-    """Write them."""
+    """Write those that differ, each at once: somebody may be reading them."""
     for path, text in pages().items():
         if path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
+            write_durably(path, text.encode())
             print(path.relative_to(ROOT))
 
 
