@@ -1,5 +1,6 @@
 """Real runs on real sockets; `tests.support.runs` starts them."""
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,8 +17,9 @@ SECOND = {"test_restarts", "test_replay", "test_study"}
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put each test into one of the queues."""
+    here = f"{Path(__file__).parent}{os.sep}"
     for item in items:
-        if Path(__file__).parent in item.path.parents and item.get_closest_marker("xdist_group") is None:
+        if str(item.path).startswith(here) and item.get_closest_marker("xdist_group") is None:
             # Who reads the recorded run waits for it: all of them in the queue that records it.
             is_second = item.path.stem in SECOND or "recorded_run" in getattr(item, "fixturenames", ())
             item.add_marker(pytest.mark.xdist_group("processes-2" if is_second else "processes-1"))
