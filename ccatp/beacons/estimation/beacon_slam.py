@@ -172,7 +172,7 @@ class BeaconSlam:
             assumed, actual = excess.get(name, (1.0, 0.0))
             if actual > assumed:
                 by_mean = self.engine.covariance[columns, i] / assumed
-                P += (actual - assumed) * np.outer(by_mean, by_mean)
+                P += (actual - assumed) * (by_mean[:, None] * by_mean)
         return P
 
     @property

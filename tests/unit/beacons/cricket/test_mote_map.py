@@ -18,6 +18,7 @@ from ccatp.beacons.cricket.mote_map import map_motes, pinned_map, plain_frame, r
 from ccatp.beacons.cricket.range_network import RangeNetwork, RigidBody, components
 from ccatp.beacons.cricket.rigidity import find_fold_over
 from ccatp.beacons.rigid_motion import aligned_rms_m, best_motion
+from tests.support.cases import slow_case
 from tests.unit.beacons.cricket.fields import (
     ALL,
     FORTY_FIVE,
@@ -296,7 +297,7 @@ def test_unfolding_finds_maps_that_plain_descent_folds() -> None:
     assert found > plain_found
 
 
-@pytest.mark.parametrize(("count", "dimension", "neighbours"), [(200, 2, 14.0), (150, 3, 26.0)])
+@pytest.mark.parametrize(("count", "dimension", "neighbours"), [slow_case(200, 2, 14.0), (150, 3, 26.0)])
 def test_many_motes_are_mapped(count: int, dimension: int, neighbours: float) -> None:
     places, pairs = drawn(count, dimension, neighbours, 9 - dimension)
     network = network_of(places, pairs, np.random.default_rng(0), sigma_m=1e-3)

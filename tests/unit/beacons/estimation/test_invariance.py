@@ -10,6 +10,7 @@ from ccatp.beacons.estimation.evaluation import judge, truth_at
 from ccatp.beacons.estimation.recording import RecordedRun, ReferencePath, first_of_each
 from ccatp.beacons.studies.recordings import FILTERS, estimate
 from ccatp.beacons.studies.trait_runs import trait_run
+from tests.support.cases import slow_case
 
 CONFIG = load_recordings_config()
 UNTIL_S = 50.0
@@ -44,17 +45,17 @@ def later(run: RecordedRun, by_s: float) -> RecordedRun:
     )
 
 
+@pytest.mark.parametrize("by_s", [slow_case(1000.0), 1.7e9])
 @pytest.mark.parametrize("name", FILTERS)
-def test_the_epoch_of_the_times_does_not_matter(name: str) -> None:
+def test_the_epoch_of_the_times_does_not_matter(name: str, by_s: float) -> None:
     """Times since 1970 are rounded to 2e-7 s. Steps of the odometry lie on the boundaries of the intervals."""
     first = estimate(RUN, CONFIG, name)
-    for by_s in (1000.0, 1.7e9):
-        again = estimate(later(RUN, by_s), CONFIG, name)
-        assert again.times_s - by_s == pytest.approx(first.times_s, abs=1e-6)
-        assert again.poses == pytest.approx(first.poses, abs=1e-4)
-        assert again.covariances == pytest.approx(first.covariances, rel=1e-2, abs=1e-7)
-        for beacon, fix in first.beacons.items():
-            assert again.beacons[beacon][:2] == pytest.approx(fix[:2], abs=1e-4)
+    again = estimate(later(RUN, by_s), CONFIG, name)
+    assert again.times_s - by_s == pytest.approx(first.times_s, abs=1e-6)
+    assert again.poses == pytest.approx(first.poses, abs=1e-4)
+    assert again.covariances == pytest.approx(first.covariances, rel=1e-2, abs=1e-7)
+    for beacon, fix in first.beacons.items():
+        assert again.beacons[beacon][:2] == pytest.approx(fix[:2], abs=1e-4)
 
 
 def test_a_time_on_a_boundary_is_in_the_interval_that_begins_there() -> None:
@@ -92,7 +93,7 @@ def test_a_sparse_truth_of_another_time_judges_nothing() -> None:
     assert found.nees is None
 
 
-@pytest.mark.parametrize("offset_m", [0.0, 0.4])
+@pytest.mark.parametrize("offset_m", [slow_case(0.0), 0.4])
 def test_a_calibration_is_within_its_stated_deviation(offset_m: float) -> None:
     """Even if the readings determine it too little to be taken for other than that of a good instrument."""
     off = []
