@@ -39,7 +39,7 @@ def listed(names: Sequence[str], most: int = 8) -> str:
 
 
 def counted(what: str, names: Sequence[str], most: int = 8) -> str:
-    """``beacon 6``, or ``beacons 6, 7, 8``."""
+    """``panel 6``, or ``panels 6, 7, 8``."""
     return f"{what}{'s' if len(names) > 1 else ''} {listed(names, most)}"
 
 
