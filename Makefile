@@ -72,8 +72,14 @@ AFTER_LINT ?=
 test: $(VENV)/.installed-dev tried-in
 	@$(MAKE) --no-print-directory -j2 tests lint $(AFTER_LINT)
 
-tests: $(VENV)/.installed-dev
+tests: $(VENV)/.compiled
 	$(PYTEST) $(PYTEST_ARGS)
+
+# All modules are compiled once, while lint begins: each of the workers of the tests would compile all of them. An error
+# of the collection is shown by the tests.
+$(VENV)/.compiled: $(VENV)/.installed-dev
+	@$(BIN)/python -m pytest --collect-only -q >/dev/null 2>&1 || true
+	@touch $@
 
 # The page is tried in a real browser and the completions in their shells, where there are these.
 TRIED_IN := chromium zsh fish
