@@ -178,6 +178,13 @@ def test_the_weight_of_a_prior_converges_in_one_solution(value: float, sigma: fl
     assert (abs(mean) > 0.8 * 0.4) == is_found
 
 
+@pytest.mark.parametrize(("value", "told"), [(4e-6, 7e-13), (4e-6, -3.6e-12), (0.31, 1.7e-5)])
+def test_a_prior_keeps_its_weight_where_readings_tell_nothing(value: float, told: float) -> None:
+    """What they seem to tell is rounding, or a solution that has not converged: it opened priors a million times."""
+    scale = 0.075
+    assert settled_square(value, scale**2 / (1.0 + told), scale, scale) == pytest.approx(scale**2, rel=0.01)
+
+
 def test_its_ellipses_contain_the_truth_where_neither_heights_nor_the_antenna_are_known() -> None:
     run = trait_run(("heights",), 0)
     given = Settings(CONFIG.csv, CONFIG.filter).but(
