@@ -53,7 +53,7 @@ EARLIER_S = 2.0  # of odometry before the window, for its delay
 
 
 SETTLED = 50  # iterations: the variance falls by a factor of FREEDOM + 1 in one where readings tell nothing
-TOLD = 1e-3  # least information of the readings on a calibration, as a share of the prior's; less is rounding
+LEAST_INFORMATION = 1e-3  # of the readings on a calibration, relative to that of its prior; less is rounding
 FREEDOM = 8.0  # of Student's t of a calibration: one of several cores costs less than a Gaussian would take
 # Standard deviation of a calibration among instruments, as a share of the prior, which is that of the worst ones.
 # Covariances are those of errors with this spread, though the estimate assumes the core, which is narrower.
@@ -112,7 +112,7 @@ def settled_square(value: float, variance: float, assumed: float, scale: float) 
     for errors that last. Of readings that tell nothing x is a quotient of rounding errors, many sigmas from zero.
     """
     information, pull = 1.0 / variance - assumed**-2, value / variance
-    if information < TOLD * assumed**-2:
+    if information < LEAST_INFORMATION * assumed**-2:
         return scale**2
     P = 1.0 / information
     for _ in range(SETTLED):
